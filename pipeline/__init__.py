@@ -1,0 +1,1 @@
+"""Campaigns and runs: files, stages, command line."""

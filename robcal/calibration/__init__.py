@@ -1,0 +1,1 @@
+"""Observation operators, identification, verification, measuring poses, mastering, cell, drift."""

@@ -1,0 +1,30 @@
+"""Errors the library raises on purpose. The class says what kind, the message which row or parameter and the remedy."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+
+class RobcalError(Exception):
+    """Base of all errors raised on purpose; its text is fit to be shown to a user."""
+
+
+class InvalidInput(RobcalError):
+    """Data or settings that contradict the contract: a NaN, a wrong unit, an unknown name."""
+
+
+class DegenerateGeometry(RobcalError):
+    """The data are well formed but their geometry carries no solution (for example collinear targets)."""
+
+
+class NotIdentifiable(RobcalError):
+    """Parameters that the data cannot tell apart.
+
+    Attributes
+    ----------
+    parameters : names of the parameters concerned.
+    """
+
+    def __init__(self, message: str, parameters: Iterable[str] = ()) -> None:
+        super().__init__(message)
+        self.parameters: tuple[str, ...] = tuple(parameters)

@@ -1,0 +1,1 @@
+"""Inside one image: blobs, sub-pixel ellipse centres with covariance, codes."""

@@ -1,0 +1,1 @@
+"""Between images: cameras, networks, bundle adjustment, resection, forward intersection, measuring bodies."""

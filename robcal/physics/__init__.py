@@ -1,0 +1,1 @@
+"""The library of physical causes: one small declarative entry each."""

@@ -1,0 +1,1 @@
+"""The robot: frames, static moments, parameters, expression-graph kernel, inverse kinematics, compensation."""
