@@ -1,0 +1,167 @@
+"""Bodies (format robcal/body-1): targets with codes, diameters and coordinates, as given or as surveyed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from pipeline.files import write_text
+from pipeline.schemas import Entry, NotNegative, Positive, Text, Triple, Whole, read_entry
+from pipeline.yaml_io import FlowMapping, yaml_text
+from robcal.errors import InvalidInput
+from robcal.transforms import Array
+
+FORMAT = "robcal/body-1"
+CODES = ("ring12", "corner")
+
+
+class TargetEntry(Entry):
+    """One target."""
+
+    id: Whole | None = None
+    code: Text | None = None
+    diameter_mm: Positive | None = None
+    xyz_mm: Triple | None = None
+    sigma_mm: NotNegative | Triple | None = None
+    polarity: Literal["bright", "dark"] | None = None
+    normal: Triple | None = None
+
+
+class BodyEntry(Entry):
+    """The whole file."""
+
+    format: Literal["robcal/body-1"]
+    targets: list[TargetEntry]
+    polarity: Literal["bright", "dark"] = "bright"
+
+
+@dataclass(frozen=True)
+class BodyTargetRow:
+    """A target of a body file in SI units; coordinates and sigma None where unknown."""
+
+    id: int | None
+    code: str | None
+    diameter: float | None
+    xyz: tuple[float, float, float] | None
+    sigma: tuple[float, float, float] | None
+    polarity: str
+
+
+@dataclass(frozen=True)
+class BodyFile:
+    """Content of a body file."""
+
+    path: Path
+    targets: tuple[BodyTargetRow, ...]
+    polarity: str
+
+    def known(self) -> tuple[BodyTargetRow, ...]:
+        """Targets with id and coordinates."""
+        return tuple(t for t in self.targets if t.id is not None and t.xyz is not None)
+
+
+def read_body(path: Path | str) -> BodyFile:
+    """Read a body file.
+
+    Raises
+    ------
+    InvalidInput : contradicts the contract: duplicate ids, two targets in one place, an impossible ring12 id.
+    """
+    entry, document = read_entry(Path(path), BodyEntry, FORMAT)
+    rows: list[BodyTargetRow] = Field(default_factory=list)
+    first: dict[int, int] = Field(default_factory=dict)
+    places: dict[tuple[float, float, float], int] = Field(default_factory=dict)
+    for i, target in enumerate(entry.targets):
+        line = document.line(("targets", i))
+        where = f"{document.path}, line {line}"
+        if target.id is not None:
+            if target.id < 0:
+                raise InvalidInput(f"{where}: target id {target.id} is negative: ids count from 0")
+            if target.id in first:
+                raise InvalidInput(
+                    f"{where}: target {target.id} stands twice (first in line {first[target.id]}): remove one or give "
+                    "it its own id"
+                )
+            first[target.id] = line or 0
+        if target.code is not None and target.code not in CODES and not target.code.startswith("aruco:"):
+            raise InvalidInput(
+                f"{where}: unknown code '{target.code}': use ring12, corner, aruco:<dictionary> or null (no code)"
+            )
+        if target.code == "ring12":
+            _check_ring12(target.id, where)
+        if target.xyz_mm is not None:
+            if target.xyz_mm in places:
+                raise InvalidInput(
+                    f"{where}: lies in the same place as the target of line {places[target.xyz_mm]}: "
+                    "check the coordinates"
+                )
+            places[target.xyz_mm] = line or 0
+            if max(map(abs, target.xyz_mm)) > 1e6:
+                raise InvalidInput(f"{where}: coordinates beyond a kilometre: they are in mm")
+        sigma = target.sigma_mm
+        rows.append(
+            BodyTargetRow(
+                id=target.id,
+                code=target.code,
+                diameter=None if target.diameter_mm is None else target.diameter_mm / 1000,
+                xyz=None if target.xyz_mm is None else _metres(target.xyz_mm),
+                sigma=None if sigma is None else _metres(sigma if isinstance(sigma, tuple) else (sigma,) * 3),
+                polarity=target.polarity or entry.polarity,
+            )
+        )
+    if not rows:
+        raise InvalidInput(f"{document.path}: lists no targets: a body needs at least three")
+    return BodyFile(document.path, tuple(rows), entry.polarity)
+
+
+def _metres(values: Sequence[float]) -> tuple[float, float, float]:
+    x, y, z = (v / 1000.0 for v in values)
+    return (x, y, z)
+
+
+def _check_ring12(code: int | None, where: str) -> None:
+    if code is None:
+        raise InvalidInput(f"{where}: a ring12 target needs its id (the number that its ring shows)")
+    if not 0 <= code < 4096:
+        raise InvalidInput(f"{where}: {code} is no ring12 id: twelve segments give 0 to 4095")
+    smallest = min(((code << k) | (code >> (12 - k))) & 0xFFF for k in range(12))
+    if smallest != code:
+        raise InvalidInput(
+            f"{where}: {code} is no ring12 id: the id is the smallest of the cyclic readings, here {smallest}"
+        )
+
+
+def write_body(
+    path: Path | str,
+    ids: Sequence[int],
+    points: Array,
+    covariance: Array | None,
+    *,
+    codes: Sequence[str | None] | None = None,
+    diameters: Sequence[float | None] | None = None,
+    polarity: str = "bright",
+    comment: str = "",
+) -> None:
+    """Write a body with coordinates (n, 3) in m and their covariance (3n, 3n) atomically.
+
+    ``sigma_mm`` is written for x, y and z apart; the full covariance has its place in the stage's cache.
+    """
+    sigma = None if covariance is None else np.sqrt(np.clip(np.diag(covariance), 0, None)).reshape(-1, 3) * 1000
+    targets = []
+    for i, number in enumerate(ids):
+        row: dict[str, Any] = FlowMapping(id=int(number), code=codes[i] if codes else None)
+        diameter = diameters[i] if diameters else None
+        known = diameter is not None and np.isfinite(diameter)
+        row["diameter_mm"] = round(float(diameter) * 1000, 9) if diameter is not None and known else None
+        row["xyz_mm"] = [round(float(v), 9) for v in np.asarray(points[i]) * 1000]
+        row["sigma_mm"] = None if sigma is None else [float(f"{v:.4g}") for v in sigma[i]]
+        targets.append(row)
+    data: dict[str, Any] = {"format": FORMAT}
+    if polarity != "bright":
+        data["polarity"] = polarity
+    data["targets"] = targets
+    write_text(Path(path), yaml_text(data, comment))

@@ -1,0 +1,110 @@
+"""Camera files (format robcal/camera-1): interior orientation and, optionally, where the camera stands."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator, Field
+
+from pipeline.files import write_text
+from pipeline.robot_file import Placement, placement_data
+from pipeline.schemas import Entry, Number, Positive, read_entry, shown
+from pipeline.yaml_io import FlowMapping, yaml_text
+from robcal.errors import InvalidInput
+from robcal.photogrammetry.camera import INTRINSIC_NAMES, Camera
+from robcal.transforms import Array
+
+FORMAT = "robcal/camera-1"
+MAX_PIXELS = 100_000
+
+
+def _side(value: Any) -> Any:
+    if isinstance(value, bool) or not isinstance(value, int) or not 0 < value <= MAX_PIXELS:
+        raise ValueError(f"must be a whole number of pixels between 1 and {MAX_PIXELS}, found {shown(value)}")
+    return value
+
+
+Side = Annotated[int, BeforeValidator(_side)]
+
+
+class CameraEntry(Entry):
+    """The whole file."""
+
+    format: Literal["robcal/camera-1"]
+    width: Side
+    height: Side
+    model: Literal["opencv"] = "opencv"
+    fx: Positive
+    fy: Positive
+    cx: Number
+    cy: Number
+    k1: Number = 0.0
+    k2: Number = 0.0
+    p1: Number = 0.0
+    p2: Number = 0.0
+    k3: Number = 0.0
+    pixel_um: Positive | None = None
+    world_T_camera: Placement | None = None
+    sigmas: dict[str, Number] = Field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class CameraFile:
+    """Content of a camera file.
+
+    Attributes
+    ----------
+    world_T_camera : (4, 4) where the camera stands, if the file says so.
+    pixel_um : size of a pixel, for reports only.
+    sigmas : standard deviations of the interior orientation by name, where known.
+    """
+
+    camera: Camera
+    world_T_camera: Array | None = None
+    pixel_um: float | None = None
+    sigmas: dict[str, float] | None = None
+
+
+def read_camera(path: Path | str) -> CameraFile:
+    """Read a camera file.
+
+    Raises
+    ------
+    InvalidInput : the file contradicts the contract or itself (principal point far outside the image).
+    """
+    entry, document = read_entry(Path(path), CameraEntry, FORMAT)
+    numbers = {name: getattr(entry, name) for name in INTRINSIC_NAMES}
+    for name, side in (("cx", entry.width), ("cy", entry.height)):
+        if not -side <= numbers[name] <= 2 * side:
+            raise InvalidInput(
+                f"{document.path}, line {document.line((name,))}: {name} = {numbers[name]:g} lies far outside the "
+                f"image of {entry.width} x {entry.height} px: it is in pixels, usually near the middle"
+            )
+    for name in ("fx", "fy"):
+        if numbers[name] < 0.05 * max(entry.width, entry.height):
+            raise InvalidInput(
+                f"{document.path}, line {document.line((name,))}: {name} = {numbers[name]:g} is too short for an image "
+                f"of {entry.width} x {entry.height} px: it is in pixels (focal length in mm divided by the pixel size)"
+            )
+    return CameraFile(
+        camera=Camera(entry.width, entry.height, **numbers),
+        world_T_camera=entry.world_T_camera.matrix() if entry.world_T_camera else None,
+        pixel_um=entry.pixel_um,
+        sigmas=dict(entry.sigmas) or None,
+    )
+
+
+def write_camera(path: Path | str, content: CameraFile, comment: str = "") -> None:
+    """Write a camera file atomically."""
+    camera = content.camera
+    data: dict[str, Any] = {"format": FORMAT, "width": camera.width, "height": camera.height, "model": "opencv"}
+    data.update({name: float(getattr(camera, name)) for name in INTRINSIC_NAMES})
+    if content.pixel_um is not None:
+        data["pixel_um"] = float(content.pixel_um)
+    if content.world_T_camera is not None:
+        data["world_T_camera"] = placement_data(content.world_T_camera)
+    if content.sigmas:
+        data["sigmas"] = FlowMapping({name: float(value) for name, value in content.sigmas.items()})
+    write_text(Path(path), yaml_text(data, comment))

@@ -1,0 +1,298 @@
+"""robot.yaml (format robcal/robot-1): nominal and calibrated robots, read and written without loss.
+
+Beside the contract's keys a calibrated robot may hold ``terms`` (extra physical terms found by the diagnosis),
+``payloads`` and the reference frames ``world_T_base`` and ``flange_T_tool``.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import BeforeValidator, Field
+
+from pipeline.files import write_text
+from pipeline.schemas import Entry, NotNegative, Number, Text, Triple, proposal, read_entry
+from pipeline.yaml_io import FlowMapping, YamlDocument, yaml_text
+from robcal.errors import InvalidInput
+from robcal.robot.model import RESERVED_FRAME_NAMES, Frame, Payload, RobotModel, Term
+from robcal.transforms import Array, frame_from_xyzrpy, xyzrpy_from_frame
+
+FORMAT = "robcal/robot-1"
+STANDARD_GRAVITY = (0.0, 0.0, -9.80665)
+
+
+def _sign(value: Any) -> Any:
+    if value not in (1, -1):
+        raise ValueError(f"sign must be 1 or -1, found {value!r}")
+    return int(value)
+
+
+def _six(value: Any) -> Any:
+    if isinstance(value, list) and len(value) == 6:
+        return {"xyz_mm": value[:3], "rpy_deg": value[3:]}
+    return value
+
+
+class PlacementEntry(Entry):
+    """A frame in a file: millimetres and degrees."""
+
+    xyz_mm: Triple = (0.0, 0.0, 0.0)
+    rpy_deg: Triple = (0.0, 0.0, 0.0)
+
+    def matrix(self) -> Array:
+        """The 4x4 frame in metres."""
+        return frame_from_xyzrpy([v / 1000 for v in self.xyz_mm] + [math.radians(v) for v in self.rpy_deg])
+
+
+Placement = Annotated[PlacementEntry, BeforeValidator(_six)]
+
+
+def placement_data(a_T_b: Array) -> FlowMapping:
+    """A frame as the mapping that stands in files."""
+    six = xyzrpy_from_frame(a_T_b)
+    return FlowMapping(xyz_mm=_listed(six[:3] * 1000), rpy_deg=_listed(np.degrees(six[3:])))
+
+
+class FrameEntry(Entry):
+    """One frame of the chain."""
+
+    name: Text
+    axis: Literal["x", "y", "z"] | None
+    type: Literal["revolute", "prismatic"] = "revolute"
+    sign: Annotated[int, BeforeValidator(_sign)] = 1
+    range_deg: tuple[Number, Number] | None = None
+    range_mm: tuple[Number, Number] | None = None
+    xyz_mm: Triple = (0.0, 0.0, 0.0)
+    rpy_deg: Triple = (0.0, 0.0, 0.0)
+    mass_kg: NotNegative = 0.0
+    cog_mm: Triple = (0.0, 0.0, 0.0)
+
+
+class PayloadEntry(Entry):
+    """A load on the flange, in flange coordinates."""
+
+    mass_kg: NotNegative
+    cog_mm: Triple = (0.0, 0.0, 0.0)
+
+    def payload(self) -> Payload:
+        """The load in SI units."""
+        return Payload(mass=self.mass_kg, cog=_metres(self.cog_mm))
+
+
+class TermEntry(Entry):
+    """An extra physical term: the value of ``expression`` is added to the named angle or offset of a frame."""
+
+    name: Text
+    frame: Text
+    kind: Literal["q", "roll", "pitch", "yaw", "x", "y", "z"]
+    expression: Text
+    parameters: dict[str, Number] = Field(default_factory=dict)
+    units: dict[str, str] = Field(default_factory=dict)
+    priors: dict[str, Number] = Field(default_factory=dict)
+    cause: str | None = None
+
+
+class RobotEntry(Entry):
+    """The whole file."""
+
+    format: Literal["robcal/robot-1"]
+    name: Text
+    gravity_m_s2: Triple = STANDARD_GRAVITY
+    gravity_frame: Literal["base", "world"] = "base"
+    frames: list[FrameEntry]
+    parameters: dict[str, Number] = Field(default_factory=dict)
+    terms: list[TermEntry] = Field(default_factory=list)
+    payloads: dict[str, PayloadEntry] = Field(default_factory=dict)
+    world_T_base: Placement | None = None
+    flange_T_tool: Placement | None = None
+
+
+def _metres(values: Triple) -> Triple:
+    return (values[0] / 1000, values[1] / 1000, values[2] / 1000)
+
+
+def _radians(values: Triple) -> Triple:
+    return (math.radians(values[0]), math.radians(values[1]), math.radians(values[2]))
+
+
+def read_robot(path: Path | str) -> RobotModel:
+    """Read a robot.
+
+    Raises
+    ------
+    InvalidInput : the file contradicts the contract; the message names line and remedy.
+    """
+    entry, document = read_entry(Path(path), RobotEntry, FORMAT)
+    _check(entry, document)
+    return RobotModel(
+        name=entry.name,
+        frames=tuple(_frame(frame) for frame in entry.frames),
+        gravity=entry.gravity_m_s2,
+        gravity_frame=entry.gravity_frame,
+        parameters=dict(entry.parameters),
+        terms=tuple(
+            Term(t.name, t.frame, t.kind, t.expression, dict(t.parameters), dict(t.units), dict(t.priors), t.cause)
+            for t in entry.terms
+        ),
+        payloads={name: load.payload() for name, load in entry.payloads.items()},
+        world_T_base=entry.world_T_base.matrix() if entry.world_T_base else None,
+        flange_T_tool=entry.flange_T_tool.matrix() if entry.flange_T_tool else None,
+    )
+
+
+def _frame(entry: FrameEntry) -> Frame:
+    prismatic = entry.type == "prismatic"
+    limits: tuple[float, float] | None = None
+    if prismatic and entry.range_mm is not None:
+        limits = (entry.range_mm[0] / 1000, entry.range_mm[1] / 1000)
+    elif entry.range_deg is not None:
+        limits = (math.radians(entry.range_deg[0]), math.radians(entry.range_deg[1]))
+    return Frame(
+        name=entry.name,
+        axis=entry.axis,
+        prismatic=prismatic,
+        sign=entry.sign,
+        limits=limits,
+        xyz=_metres(entry.xyz_mm),
+        rpy=_radians(entry.rpy_deg),
+        mass=entry.mass_kg,
+        cog=_metres(entry.cog_mm),
+    )
+
+
+def _check(entry: RobotEntry, document: YamlDocument) -> None:
+    names = [frame.name for frame in entry.frames]
+    for i, frame in enumerate(entry.frames):
+        where = f"{document.path}, line {document.line(('frames', i))}: frame '{frame.name}'"
+        if names.index(frame.name) != i:
+            raise InvalidInput(f"{where} stands twice: give every frame its own name")
+        if frame.name in {*RESERVED_FRAME_NAMES, "world"} or "." in frame.name:
+            raise InvalidInput(
+                f"{where}: a frame's name must have no dot and not be base, tool, gravity, payload or world: "
+                "it is the first half of parameter names"
+            )
+        if frame.type == "prismatic" and frame.axis is None:
+            raise InvalidInput(f"{where}: a sliding joint needs an axis (x, y or z)")
+        if frame.range_mm is not None and frame.type != "prismatic":
+            raise InvalidInput(f"{where}: range_mm is for sliding joints: use range_deg or add 'type: prismatic'")
+        if frame.range_deg is not None and frame.type == "prismatic":
+            raise InvalidInput(f"{where}: range_deg is for turning joints: use range_mm")
+        for limits in (frame.range_deg, frame.range_mm):
+            if limits is not None and limits[0] >= limits[1]:
+                raise InvalidInput(f"{where}: the range {list(limits)} is empty: the smaller limit comes first")
+    if not any(frame.axis for frame in entry.frames):
+        raise InvalidInput(f"{document.path}: the chain has no joints: at least one frame needs an axis (x, y or z)")
+    size = math.dist(entry.gravity_m_s2, (0, 0, 0))
+    if size > 30:
+        raise InvalidInput(
+            f"{document.path}, line {document.line(('gravity_m_s2',))}: gravity of {size:.4g} m/s2 is not of this "
+            "world: it is in m/s2, about 9.81"
+        )
+    known_terms = {term.name for term in entry.terms}
+    for key in entry.parameters:
+        _check_parameter(key, names, known_terms, set(entry.payloads), document)
+    for i, term in enumerate(entry.terms):
+        if term.frame not in {*names, "base", "tool"}:
+            raise InvalidInput(
+                f"{document.path}, line {document.line(('terms', i, 'frame'))}: term '{term.name}' acts on the unknown "
+                f"frame '{term.frame}'{proposal(term.frame, [*names, 'base', 'tool'])}"
+            )
+
+
+_KINDS = ["x", "y", "z", "roll", "pitch", "yaw"]
+_FRAME_KINDS = [*_KINDS, "elastic_roll", "elastic_pitch", "elastic_yaw"]
+
+
+def _check_parameter(
+    key: str, frames: list[str], terms: set[str], payloads: set[str], document: YamlDocument
+) -> None:
+    owner, _, kind = key.rpartition(".")
+    where = f"{document.path}, line {document.line(('parameters', key))}: parameter '{key}'"
+    if owner in terms:
+        return
+    if owner.startswith("payload."):
+        if owner.removeprefix("payload.") not in payloads or kind not in {"mass", "x", "y", "z"}:
+            raise InvalidInput(f"{where} names no payload of this file: payload.<name>.mass, x, y or z")
+        return
+    known = {"base": _KINDS, "tool": _KINDS, "gravity": ["tilt_x", "tilt_y"], **dict.fromkeys(frames, _FRAME_KINDS)}
+    if owner not in known:
+        raise InvalidInput(f"{where}: there is no frame '{owner}'{proposal(owner, list(known))}")
+    if kind not in known[owner]:
+        raise InvalidInput(f"{where}: unknown kind '{kind}'{proposal(kind, known[owner])}")
+
+
+def _listed(values: Array) -> list[float]:
+    # twelve decimals of a millimetre or degree: below any meaning, above the noise of unit conversion
+    return [float(v) + 0.0 for v in np.round(np.asarray(values, dtype=float), 12)]
+
+
+def robot_data(model: RobotModel) -> dict[str, Any]:
+    """The file's content as plain data."""
+    frames = []
+    for frame in model.frames:
+        row = FlowMapping(name=frame.name, axis=frame.axis)
+        if frame.prismatic:
+            row["type"] = "prismatic"
+        if frame.axis is not None:
+            row["sign"] = int(frame.sign)
+            if frame.limits is not None:
+                limits = np.array(frame.limits)
+                key, shown = ("range_mm", limits * 1000) if frame.prismatic else ("range_deg", np.degrees(limits))
+                row[key] = _listed(shown)
+        row["xyz_mm"] = _listed(np.asarray(frame.xyz) * 1000)
+        row["rpy_deg"] = _listed(np.degrees(frame.rpy))
+        if frame.mass or np.any(frame.cog):
+            row["mass_kg"] = float(frame.mass)
+            row["cog_mm"] = _listed(np.asarray(frame.cog) * 1000)
+        frames.append(row)
+    data: dict[str, Any] = {
+        "format": FORMAT,
+        "name": model.name,
+        "gravity_m_s2": [float(v) for v in model.gravity],
+    }
+    if model.gravity_frame != "base":
+        data["gravity_frame"] = model.gravity_frame
+    data["frames"] = frames
+    data["parameters"] = {name: float(value) for name, value in model.parameters.items()}
+    if model.terms:
+        data["terms"] = [_term_data(term) for term in model.terms]
+    if model.payloads:
+        data["payloads"] = {
+            name: FlowMapping(mass_kg=float(load.mass), cog_mm=_listed(np.asarray(load.cog) * 1000))
+            for name, load in model.payloads.items()
+        }
+    if model.world_T_base is not None:
+        data["world_T_base"] = placement_data(model.world_T_base)
+    if model.flange_T_tool is not None:
+        data["flange_T_tool"] = placement_data(model.flange_T_tool)
+    return data
+
+
+def _term_data(term: Term) -> dict[str, Any]:
+    data: dict[str, Any] = {
+        "name": term.name,
+        "frame": term.frame,
+        "kind": term.kind,
+        "expression": term.expression,
+        "parameters": {k: float(v) for k, v in term.parameters.items()},
+    }
+    if term.units:
+        data["units"] = dict(term.units)
+    if term.priors:
+        data["priors"] = {k: float(v) for k, v in term.priors.items()}
+    if term.cause:
+        data["cause"] = term.cause
+    return data
+
+
+def robot_text(model: RobotModel, comment: str = "") -> str:
+    """The text of a robot file."""
+    return yaml_text(robot_data(model), comment)
+
+
+def write_robot(path: Path | str, model: RobotModel, comment: str = "") -> None:
+    """Write a robot atomically; reading it back gives the same model."""
+    write_text(Path(path), robot_text(model, comment))

@@ -1,0 +1,169 @@
+"""Ground rules of every YAML file: unknown keys are errors with the nearest known one, numbers are finite numbers.
+
+A validation error becomes one sentence that names the file, the line, the entry and the remedy.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError, model_validator
+
+from pipeline.yaml_io import YamlDocument, read_yaml
+from robcal.errors import InvalidInput
+
+
+def _number(value: Any) -> Any:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ValueError(f"must be a number, found {shown(value)}")
+    try:
+        number = float(value)
+    except OverflowError:
+        raise ValueError("is too large for a number") from None
+    if not math.isfinite(number):
+        raise ValueError(f"must be a finite number, found {value}")
+    return number
+
+
+def _positive(value: Any) -> Any:
+    if _number(value) <= 0:
+        raise ValueError(f"must be larger than zero, found {value}")
+    return float(value)
+
+
+def _not_negative(value: Any) -> Any:
+    if _number(value) < 0:
+        raise ValueError(f"must not be negative, found {value}")
+    return float(value)
+
+
+def _whole(value: Any) -> Any:
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise ValueError(f"must be a whole number, found {shown(value)}")
+    if abs(value) > 2**53:
+        raise ValueError("is too large for a whole number here")
+    return value
+
+
+def _text(value: Any) -> Any:
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        return str(value)  # a name like 007 or 3 is text although YAML reads a number
+    if not isinstance(value, str) or not value.strip():
+        raise ValueError(f"must be text, found {shown(value)}")
+    return value
+
+
+def shown(value: Any) -> str:
+    """A value cut short for a message."""
+    if value is None:
+        return "nothing"
+    text = repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+Number = Annotated[float, BeforeValidator(_number)]
+Positive = Annotated[float, BeforeValidator(_positive)]
+NotNegative = Annotated[float, BeforeValidator(_not_negative)]
+Whole = Annotated[int, BeforeValidator(_whole)]
+Text = Annotated[str, BeforeValidator(_text)]
+Triple = tuple[Number, Number, Number]
+
+
+class Entry(BaseModel):
+    """Base of all entries: frozen, strict, unknown keys refused with a proposal."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=False)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _known_keys(cls, data: Any) -> Any:
+        if isinstance(data, cls):
+            return data
+        if not isinstance(data, dict):
+            raise ValueError(f"must be a mapping with the keys {', '.join(_names(cls))}, found {shown(data)}")
+        known = _names(cls)
+        for key in data:
+            if key not in known:
+                raise ValueError(f"unknown key '{key}'{proposal(str(key), known)}")
+        return data
+
+
+def _names(cls: type[BaseModel]) -> list[str]:
+    return [info.alias or name for name, info in cls.model_fields.items()]
+
+
+def proposal(word: str, known: list[str]) -> str:
+    """Text that names the nearest known word, or all of them when none is near."""
+    lowered = {name.lower(): name for name in known}
+    near = difflib.get_close_matches(word.lower(), lowered, n=1, cutoff=0.6)
+    if near:
+        return f": did you mean '{lowered[near[0]]}'?"
+    listed = ", ".join(known[:30]) + (", ..." if len(known) > 30 else "")
+    return f": known are {listed}" if known else ""
+
+
+E = TypeVar("E", bound=Entry)
+
+
+def parse(document: YamlDocument, schema: type[E], file_format: str) -> E:
+    """The validated content of a document.
+
+    Raises
+    ------
+    InvalidInput : wrong or missing ``format``, unknown key, wrong type; the first problem in one sentence.
+    """
+    found = document.data.get("format")
+    if found != file_format:
+        told = "is missing" if found is None else f"is {shown(found)}"
+        raise InvalidInput(f"{document.path}: 'format' {told}, this must be a file of the format '{file_format}'")
+    try:
+        return schema.model_validate(document.data)
+    except ValidationError as error:
+        raise InvalidInput(first_problem(document, error)) from None
+
+
+def read_entry(path: Path, schema: type[E], file_format: str) -> tuple[E, YamlDocument]:
+    """Read and validate a YAML file."""
+    document = read_yaml(path)
+    return parse(document, schema, file_format), document
+
+
+def first_problem(document: YamlDocument, error: ValidationError) -> str:
+    """One sentence about the first problem of a validation error, with file and line."""
+    # An alternative (a | b) reports one problem for each branch; the deepest place is the branch that was meant.
+    problem = max(error.errors(), key=lambda item: len(_place(item["loc"], document)))
+    place = _place(problem["loc"], document)
+    line = document.line(place)
+    where = f"{document.path}, line {line}" if line else f"{document.path}"
+    name = _dotted(place)
+    told = problem["msg"].removeprefix("Value error, ")
+    if problem["type"] == "missing":
+        missing = str(problem["loc"][-1])
+        told = f"the entry '{missing}' is missing"
+    elif problem["type"] in {"tuple_type", "list_type", "dict_type"} or problem["type"].startswith("too_"):
+        told = f"{told[0].lower()}{told[1:]}, found {shown(problem['input'])}"
+    elif problem["type"] == "literal_error":
+        told = f"must be {problem['ctx']['expected']}, found {shown(problem['input'])}"
+    return f"{where}: {name + ': ' if name else ''}{told}"
+
+
+def _place(location: tuple[int | str, ...], document: YamlDocument) -> tuple[int | str, ...]:
+    """Pydantic's location without the names of union branches, which are no keys of the file."""
+    place: list[int | str] = []
+    data: Any = document.data
+    for step in location:
+        inside = step in data if isinstance(data, dict) else isinstance(data, list) and step in range(len(data))
+        if inside:
+            data = data[step]
+            place.append(step)
+    return tuple(place)
+
+
+def _dotted(place: tuple[int | str, ...]) -> str:
+    text = ""
+    for step in place:
+        text += f"[{step}]" if isinstance(step, int) else f".{step}" if text else str(step)
+    return text
