@@ -1,0 +1,133 @@
+"""What a physical cause is to the software: where it acts, its law, its parameters and how they are told.
+
+A `Family` is one cause at one place. Its law is linear in its parameters (amplitudes); constants that bend the law
+(an order, the pose of a jump, a torque scale, a time constant) come from a grid, and the continuous ones among them
+may be refined between the grid's values. Robot families act through the kernel: `bases` names expressions of the
+robot's variables that are added to a number of a frame. Observation families act on what was measured: `displace`
+gives the displacement of every observation per unit of each parameter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from robcal.transforms import Array
+
+Constants = Mapping[str, float]
+Report = Callable[[Array, Constants], dict[str, object]]
+
+DEG = float(np.degrees(1.0))
+PER_KNM = DEG * 1e3
+"""rad/(N m) to deg/(kN m)."""
+
+
+@dataclass(frozen=True)
+class Basis:
+    """`parameter * expression` is added to the `kind` (q, x .. yaw) of `frame`."""
+
+    frame: str
+    kind: str
+    expression: str
+    parameter: str
+
+
+@dataclass(frozen=True)
+class Family:
+    """One cause at one place.
+
+    Attributes
+    ----------
+    cause, stage, where, direction : as in the contract of names.
+    parameters : short names of the amplitudes, the order of the columns.
+    priors : typical size of each amplitude (SI), the standard deviation of its prior.
+    report : amplitudes (SI) and constants to the contract's parameters with their units.
+    sentence : template for people, filled with the reported parameters, `where` and `direction`.
+    grid : values of the constants to be tried.
+    continuous : constants that may be refined, with their bounds.
+    weight : prior weight of the whole family (a cause that may act at many places shares one weight among them).
+    bases : robot families: constants to the expressions.
+    frees : robot families: parameters the kernel has already, which the cause sets free (order of `parameters`).
+    displace : observation families: (data, constants) to displacements (m, k, parameters), see `ObservationData`.
+    """
+
+    cause: str
+    stage: str
+    where: str
+    direction: str | None
+    parameters: tuple[str, ...]
+    priors: tuple[float, ...]
+    report: Report
+    sentence: str
+    grid: tuple[Constants, ...] = ({},)
+    continuous: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    weight: float = 1.0
+    bases: Callable[[Constants], tuple[Basis, ...]] | None = None
+    frees: tuple[str, ...] = ()
+    displace: Callable[[ObservationData, Constants], Array] | None = None
+    covariates: tuple[str, ...] = ()
+
+    @property
+    def key(self) -> tuple[str, str, str | None]:
+        """What makes the family one of its kind; `from` of a coupling is part of its constants."""
+        return (self.cause, self.where, self.direction)
+
+
+@dataclass(frozen=True)
+class ObservationData:
+    """What observation families may need: one row per observation, in the order of the residuals.
+
+    Attributes
+    ----------
+    kind : 'frames' (six numbers a row), 'points' (three), 'distances' (one), 'sensor' (three, mapped to the world).
+    pose : (m,) row of the pose of each observation.
+    target : (m,) id of the target, -1 for frames and distances.
+    world_T_tool : (m, 4, 4) modelled frame of the tool at each observation.
+    p_tool : (m, 3) modelled coordinates of the target in the tool (zeros for frames).
+    p_world : (m, 3) modelled position in the measuring system.
+    p_sensor : (m, 3) measured coordinates in the sensor, if there is one.
+    variables : per pose, the covariates (time_s, temp_*, index ...) and the kernel's variables, each (n,).
+    """
+
+    kind: str
+    pose: Array
+    target: Array
+    world_T_tool: Array
+    p_tool: Array
+    p_world: Array
+    p_sensor: Array | None
+    variables: Mapping[str, Array]
+
+
+def numeric_sigma(
+    report: Report, values: Array, constants: Constants, covariance: Array
+) -> tuple[dict[str, object], dict[str, object]]:
+    """Reported parameters and their standard deviations by first-order propagation (central differences).
+
+    Text and constants are passed through without a sigma. Weakness: an amplitude near zero has a skew distribution
+    that a standard deviation does not tell.
+    """
+    told = report(values, constants)
+    numbers = [name for name, value in told.items() if isinstance(value, (float, list)) and name not in constants]
+    flat = {name: np.atleast_1d(np.asarray(told[name], dtype=float)) for name in numbers}
+    spread = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
+    slopes: dict[str, list[Array]] = {name: [] for name in numbers}
+    for k, size in enumerate(spread):
+        step = np.zeros_like(values)
+        step[k] = 1e-3 * size if size > 0 else 1e-12
+        up, down = report(values + step, constants), report(values - step, constants)
+        for name in numbers:
+            change = np.atleast_1d(np.asarray(up[name], dtype=float)) - np.atleast_1d(np.asarray(down[name], float))
+            if name.startswith(("phase", "azimuth")):
+                change = (change + 180.0) % 360.0 - 180.0
+            slopes[name].append(change / (2.0 * step[k]))
+    sigma: dict[str, object] = {}
+    for name in numbers:
+        jacobian = np.stack(slopes[name], axis=-1)
+        deviations = np.sqrt(np.clip(np.einsum("ij,jk,ik->i", jacobian, covariance, jacobian), 0.0, None))
+        sigma[name] = float(deviations[0]) if len(flat[name]) == 1 and not isinstance(told[name], list) else [
+            float(v) for v in deviations
+        ]
+    return told, sigma

@@ -1,0 +1,276 @@
+"""Causes that act in the direction of rotation of a joint: compliance, backlash, hysteresis, gears, references."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from robcal.physics.family import PER_KNM, Basis, Constants, Family
+from robcal.physics.site import Joint, RobotSite, exponential_law
+from robcal.transforms import Array
+
+TORQUE_SCALES_NM = (5.0, 15.0, 50.0, 150.0, 500.0)
+THRESHOLDS_NM = (0.5, 5.0, 20.0, 80.0)
+HIGHEST_RIPPLE_ORDER = 180
+
+
+def joint_families(site: RobotSite) -> Iterator[Family]:
+    """All families of causes about the joints' own axes."""
+    joints = [joint for joint in site.joints if site.varies(f"q{joint.number}", 1e-6)]
+    makers = (_stiffness, _backlash, _hysteresis, _lost_motion, _zero_jump, _eccentricity, _ripple, _ratio, _zero_drift)
+    for maker in makers:
+        families = [family for joint in joints for family in maker(site, joint)]
+        yield from (_share(family, len(joints)) for family in families)
+    couplings = [f for joint in joints for f in _coupling(joint, joints)]
+    yield from (_share(family, len(couplings)) for family in couplings)
+    yield from _counterbalance(site, joints)
+
+
+def _share(family: Family, places: int) -> Family:
+    return replace(family, weight=family.weight / max(places, 1))
+
+
+def _amplitude_phase(values: Array, factor: float) -> tuple[float, float]:
+    return float(np.hypot(*values) * factor), float(np.degrees(np.arctan2(values[1], values[0])))
+
+
+def _stiffness(site: RobotSite, joint: Joint) -> Iterator[Family]:
+    k = joint.number
+    if joint.prismatic or not site.varies(f"torque{k}", 1.0):
+        return
+    elastic = f"{joint.frame}.elastic_{joint.own_angle}"
+    linear_fitted = elastic in site.fitted
+    if not linear_fitted and elastic not in site.tied:
+        yield Family(
+            "joint_compliance", "robot", joint.where, LETTER[joint.own_angle], (elastic,), (3e-6,),
+            lambda v, c: {"compliance_deg_per_kNm": float(v[0]) * PER_KNM},
+            "{where} gives way about its own axis by {compliance_deg_per_kNm:.3g} deg/kNm, which the model leaves out",
+            frees=(elastic,),
+        )
+    held = float(site.model.parameters.get(elastic, 0.0))
+    torque = f"torque{k}"
+    largest = float(np.max(np.abs(site.variables[torque])))
+    cubic = Basis(joint.frame, "q", f"{torque}*{torque}*{torque}", "cubic")
+    linear = Basis(joint.frame, "q", torque, "linear")
+
+    def report(v: Array, c: Constants) -> dict[str, object]:
+        first = held if linear_fitted else held + float(v[1])
+        return {"linear_deg_per_kNm": first * PER_KNM, "cubic_deg_per_kNm3": float(v[0]) * np.degrees(1.0) * 1e9}
+
+    yield Family(
+        "stiffness_nonlinear", "robot", joint.where, LETTER[joint.own_angle],
+        ("cubic",) if linear_fitted else ("cubic", "linear"),
+        (2e-4 / largest**3,) if linear_fitted else (2e-4 / largest**3, 3e-6),
+        report,
+        "The gear of {where} stiffens or softens with load: cubic term {cubic_deg_per_kNm3:.3g} deg/kNm^3",
+        bases=(lambda c: (cubic,)) if linear_fitted else (lambda c: (cubic, linear)),
+        covariates=(torque,),
+    )
+
+
+LETTER = {"roll": "x", "pitch": "y", "yaw": "z", "x": "x", "y": "y", "z": "z"}
+
+
+def _lag(joint: Joint) -> float:
+    return 2e-4 if not joint.prismatic else 1e-4
+
+
+def _backlash(site: RobotSite, joint: Joint) -> Iterator[Family]:
+    k = joint.number
+    torque = site.variables[f"torque{k}"]
+    moved = site.varies(f"approach{k}")
+    largest = float(np.max(np.abs(torque)))
+    loaded = largest > 1e-3
+    if not moved and not (loaded and np.min(torque) < 0 < np.max(torque)):
+        return
+    name = f"width_{joint.unit}"
+    thresholds = [t for t in THRESHOLDS_NM if t < largest] if loaded and moved else []
+    grid: tuple[Constants, ...] = tuple({"threshold_Nm": t} for t in thresholds) or ({},)
+
+    def bases(c: Constants) -> tuple[Basis, ...]:
+        lag = f"-0.5*approach{k}"
+        if not loaded:
+            law = lag
+        elif not moved:
+            law = f"0.5*sign(torque{k})"
+        else:
+            law = f"where(abs(torque{k}) > {c.get('threshold_Nm', 1e9)!r}, 0.5*sign(torque{k}), {lag})"
+        return (Basis(joint.frame, "q", law, "width"),)
+
+    yield Family(
+        "backlash", "robot", joint.where, LETTER[joint.own_angle], ("width",), (_lag(joint),),
+        lambda v, c: {name: float(v[0]) * joint.factor, **({"threshold_Nm": c["threshold_Nm"]} if c else {})},
+        "{where} has {" + name + ":.4f} " + joint.unit + " of backlash the model does not know",
+        grid=grid, bases=bases, covariates=(f"approach{k}", f"torque{k}"),
+    )
+
+
+def _hysteresis(site: RobotSite, joint: Joint) -> Iterator[Family]:
+    k = joint.number
+    if not site.varies(f"approach{k}"):
+        return
+    name = f"width_{joint.unit}"
+    yield Family(
+        "hysteresis", "robot", joint.where, LETTER[joint.own_angle], ("width",), (_lag(joint),),
+        lambda v, c: {name: float(v[0]) * joint.factor},
+        "{where} lags behind by {" + name + ":.4f} " + joint.unit + " between the two approach directions",
+        bases=lambda c: (Basis(joint.frame, "q", f"-0.5*approach{k}", "width"),),
+        covariates=(f"approach{k}",),
+    )
+
+
+def _lost_motion(site: RobotSite, joint: Joint) -> Iterator[Family]:
+    k = joint.number
+    torque = site.variables[f"torque{k}"]
+    largest = float(np.max(np.abs(torque)))
+    if joint.prismatic or not site.varies(f"torque{k}", 1.0):
+        return
+    scales = [s for s in TORQUE_SCALES_NM if 0.005 * largest < s < 1.5 * largest] or [0.3 * largest]
+    yield Family(
+        "lost_motion", "robot", joint.where, LETTER[joint.own_angle], ("amplitude",), (2e-4,),
+        lambda v, c: {"amplitude_deg": float(v[0]) * np.degrees(1.0), "torque_Nm": c["torque_Nm"]},
+        "{where} loses {amplitude_deg:.4f} deg around zero load (lost motion, scale {torque_Nm:.0f} N m)",
+        grid=tuple({"torque_Nm": s} for s in scales),
+        continuous={"torque_Nm": (0.003 * largest, 2.0 * largest)},
+        bases=lambda c: (Basis(joint.frame, "q", f"tanh(torque{k}/{c['torque_Nm']!r})", "amplitude"),),
+        covariates=(f"torque{k}",),
+    )
+
+
+def _zero_jump(site: RobotSite, joint: Joint) -> Iterator[Family]:
+    order = np.sort(site.variables["index"])
+    name = f"jump_{joint.unit}"
+    yield Family(
+        "zero_jump", "robot", joint.where, LETTER[joint.own_angle], ("jump",), (5e-4,),
+        lambda v, c: {"pose": c["pose"], name: float(v[0]) * joint.factor},
+        "The zero of {where} jumped by {" + name + ":.4f} " + joint.unit + " at pose {pose}",
+        grid=tuple({"pose": float(i)} for i in order[2:-1]),
+        bases=lambda c: (Basis(joint.frame, "q", f"step(index - {c['pose'] - 0.5!r})", "jump"),),
+        covariates=("index",),
+    )
+
+
+def _harmonic(k: int, frame: str, kind: str, order: float) -> tuple[Basis, Basis]:
+    return (
+        Basis(frame, kind, f"cos({order!r}*q{k})", "cosine"),
+        Basis(frame, kind, f"sin({order!r}*q{k})", "sine"),
+    )
+
+
+def _eccentricity(site: RobotSite, joint: Joint) -> Iterator[Family]:
+    if joint.prismatic:
+        return
+
+    def report(v: Array, c: Constants) -> dict[str, object]:
+        amplitude, phase = _amplitude_phase(v, np.degrees(1.0))
+        return {"order": int(c["order"]), "amplitude_deg": amplitude, "phase_deg": phase}
+
+    yield Family(
+        "joint_eccentricity", "robot", joint.where, LETTER[joint.own_angle], ("cosine", "sine"), (3e-4, 3e-4), report,
+        "The encoder or gear of {where} runs out of centre: {amplitude_deg:.4f} deg, order {order}",
+        grid=({"order": 1.0}, {"order": 2.0}),
+        bases=lambda c: _harmonic(joint.number, joint.frame, "q", c["order"]),
+        covariates=(f"q{joint.number}",),
+    )
+
+
+def _ripple(site: RobotSite, joint: Joint) -> Iterator[Family]:
+    if joint.prismatic:
+        return
+
+    def report(v: Array, c: Constants) -> dict[str, object]:
+        amplitude, phase = _amplitude_phase(v, np.degrees(1.0))
+        nearest = round(c["order"])
+        order = nearest if abs(c["order"] - nearest) < 1e-6 else c["order"]
+        return {"order": order, "amplitude_deg": amplitude, "phase_deg": phase}
+
+    yield Family(
+        "gear_ripple", "robot", joint.where, LETTER[joint.own_angle], ("cosine", "sine"), (1e-4, 1e-4), report,
+        "The gear of {where} ripples {order:g} times a turn with {amplitude_deg:.4f} deg",
+        grid=tuple({"order": float(o)} for o in range(3, HIGHEST_RIPPLE_ORDER + 1)),
+        bases=lambda c: _harmonic(joint.number, joint.frame, "q", c["order"]),
+        covariates=(f"q{joint.number}",),
+    )
+
+
+def _ratio(site: RobotSite, joint: Joint) -> Iterator[Family]:
+    k = joint.number
+    yield Family(
+        "transmission_ratio", "robot", joint.where, LETTER[joint.own_angle], ("ratio",), (2e-4,),
+        lambda v, c: {"ratio_error_ppm": float(v[0]) * 1e6},
+        "The transmission of {where} turns {ratio_error_ppm:.0f} ppm more than its ratio says",
+        bases=lambda c: (Basis(joint.frame, "q", f"q{k}", "ratio"),),
+        covariates=(f"q{k}",),
+    )
+
+
+def _coupling(joint: Joint, joints: list[Joint]) -> Iterator[Family]:
+    for driver in joints:
+        if driver.number == joint.number or driver.prismatic != joint.prismatic:
+            continue
+
+        def bases(c: Constants, j: int = driver.number) -> tuple[Basis, ...]:
+            return (Basis(joint.frame, "q", f"q{j}", "ratio"),)
+
+        def report(v: Array, c: Constants, where: str = driver.where) -> dict[str, object]:
+            return {"from": where, "ratio": float(v[0])}
+
+        yield Family(
+            "joint_coupling", "robot", joint.where, LETTER[joint.own_angle], ("ratio",), (3e-4,), report,
+            "{where} is dragged along by {from}: {ratio:.2e} of its angle",
+            bases=bases, covariates=(f"q{driver.number}",),
+        )
+
+
+def _counterbalance(site: RobotSite, joints: list[Joint]) -> Iterator[Family]:
+    # A balancing cylinder or spring hangs at the shoulder: the joint with the largest torque.
+    loaded = [joint for joint in joints if not joint.prismatic and site.varies(f"torque{joint.number}", 50.0)]
+    if not loaded:
+        return
+    joint = max(loaded, key=lambda j: float(np.max(np.abs(site.variables[f"torque{j.number}"]))))
+    elastic = float(site.model.parameters.get(f"{joint.frame}.elastic_{joint.own_angle}", 0.0))
+    if elastic <= 1e-8:
+        return
+
+    def report(v: Array, c: Constants) -> dict[str, object]:
+        amplitude, phase = _amplitude_phase(v, 1.0)
+        return {"torque_Nm": amplitude, "phase_deg": phase}
+
+    yield Family(
+        "counterbalance", "robot", joint.where, LETTER[joint.own_angle], ("cosine", "sine"), (300.0, 300.0), report,
+        "A balancing torque of {torque_Nm:.0f} N m acts on {where} that the model does not know",
+        bases=lambda c: tuple(
+            replace(b, expression=f"{elastic!r}*{b.expression}")
+            for b in _harmonic(joint.number, joint.frame, "q", 1.0)
+        ),
+        covariates=(f"q{joint.number}",),
+    )
+
+
+def _zero_drift(site: RobotSite, joint: Joint) -> Iterator[Family]:
+    for name in site.temperatures():
+        first = float(site.variables[name][int(np.argmin(site.variables["index"]))])
+
+        def bases(c: Constants, law: str = f"({name} - {first!r})") -> tuple[Basis, ...]:
+            return (Basis(joint.frame, "q", law, "drift"),)
+
+        yield Family(
+            "thermal_zero_drift", "robot", joint.where, LETTER[joint.own_angle], ("drift",), (3e-5,),
+            lambda v, c: {f"{joint.unit}_per_K": float(v[0]) * joint.factor},
+            "The zero of {where} drifts by {" + f"{joint.unit}_per_K" + ":.5f} " + joint.unit + " per kelvin",
+            bases=bases, covariates=(name,), weight=0.5,
+        )
+    duration = site.duration_h()
+    if duration > 0:
+        start = float(np.min(site.variables["time_s"]))
+        yield Family(
+            "thermal_zero_drift", "robot", joint.where, LETTER[joint.own_angle], ("drift",), (3e-4 / duration,),
+            lambda v, c: {f"{joint.unit}_per_h": float(v[0]) * joint.factor, "tau_h": c["tau_h"]},
+            "The zero of {where} drifts by {" + f"{joint.unit}_per_h" + ":.5f} " + joint.unit + " per hour",
+            grid=tuple({"tau_h": share * duration} for share in (0.1, 0.25, 0.6, 3.0)),
+            continuous={"tau_h": (0.02 * duration, 10.0 * duration)},
+            bases=lambda c: (Basis(joint.frame, "q", exponential_law(start, duration, c["tau_h"]), "drift"),),
+            covariates=("time_s",), weight=0.5,
+        )

@@ -1,0 +1,225 @@
+"""Causes in what was measured: station, body, wire and sensor in the hand. They displace observations, not the robot.
+
+The displacement of an observation is what the recording shows minus what it would show without the cause, per unit
+of each parameter, in the coordinates of the observation: metres in the world for points and sensor points, the right
+twist of the frame (translation first) for frames, metres along the wire for distances.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from robcal.physics.family import DEG, Constants, Family, ObservationData
+from robcal.transforms import Array
+
+STEEL_WIRE_N = 5.0
+"""Tension that a draw-wire encoder typically keeps up (makers' data sheets: 2 to 10 N); sag scales with its inverse."""
+GRAVITY = 9.80665
+
+
+def measuring_families(data: ObservationData, ids: tuple[int, ...], body: str) -> Iterator[Family]:
+    """Families for the kind of observation at hand; `ids` are the targets of the body, `body` its name."""
+    if data.kind in ("points", "frames"):
+        yield from _station(data)
+    if data.kind == "points":
+        yield from _body(data, ids, body)
+    if data.kind == "distances":
+        yield from _wire()
+    if data.kind == "sensor":
+        yield from _sensor(data, body)
+
+
+def _times(data: ObservationData) -> Iterator[tuple[str, Array, str]]:
+    """Covariates of slow change: name, values per pose from the first one on, unit in the contract."""
+    index = data.variables["index"]
+    first = int(np.argmin(index))
+    for name, values in data.variables.items():
+        if name.startswith("temp_") and np.ptp(values) > 0.2:
+            yield name, values - values[first], "K"
+
+
+def _hours(data: ObservationData) -> tuple[Array, float] | None:
+    seconds = data.variables.get("time_s")
+    if seconds is None or np.ptp(seconds) <= 0:
+        return None
+    hours = (seconds - np.min(seconds)) / 3600.0
+    return hours, float(np.max(hours))
+
+
+def _warming(hours: Array, duration: float, tau: float) -> Array:
+    return duration * np.expm1(-hours / tau) / np.expm1(-duration / tau)
+
+
+def _world(data: ObservationData, shift: Array, turn: Array | None = None) -> Array:
+    """Displacements of the observations for displacements (m, 3, k) in the world and turns (m, 3, k) of frames."""
+    if data.kind == "points":
+        return shift
+    R = np.swapaxes(data.world_T_tool[:, :3, :3], 1, 2)
+    turned = np.zeros_like(shift) if turn is None else R @ turn
+    return np.concatenate([R @ shift, turned], axis=1)
+
+
+def _positions(data: ObservationData) -> Array:
+    return data.p_world if data.kind == "points" else data.world_T_tool[:, :3, 3]
+
+
+def _station(data: ObservationData) -> Iterator[Family]:
+    p = _positions(data)
+    scale = Family(
+        "scale_error", "camera", "station", None, ("scale",), (1e-4,),
+        lambda v, c: {"ppm": float(v[0]) * 1e6},
+        "The station measures lengths {ppm:.0f} ppm too long",
+        displace=lambda d, c: _world(d, _positions(d)[:, :, None]),
+    )
+    if data.kind == "points" and len(np.unique(data.target)) >= 2:
+        yield scale  # with frames alone the lengths of the robot absorb it
+    for name, values, _ in _times(data):
+
+        def drift(d: ObservationData, c: Constants, v: Array = values) -> Array:
+            return _world(d, _positions(d)[:, :, None] * v[d.pose][:, None, None])
+
+        yield replace(
+            scale, cause="scale_drift", priors=(2e-5,), report=lambda v, c: {"ppm_per_K": float(v[0]) * 1e6},
+            sentence="The scale of the station drifts by {ppm_per_K:.1f} ppm per kelvin", displace=drift,
+            covariates=(name,), weight=0.5,
+        )
+    clock = _hours(data)
+    if clock is not None:
+        hours, duration = clock
+        yield replace(
+            scale, cause="scale_drift", priors=(1e-4 / duration,), covariates=("time_s",), weight=0.5,
+            report=lambda v, c: {"ppm_per_h": float(v[0]) * 1e6, "tau_h": c["tau_h"]},
+            sentence="The scale of the station drifts by {ppm_per_h:.1f} ppm per hour",
+            grid=tuple({"tau_h": share * duration} for share in (0.1, 0.25, 0.6, 3.0)),
+            continuous={"tau_h": (0.02 * duration, 10.0 * duration)},
+            displace=lambda d, c: _world(
+                d, _positions(d)[:, :, None] * _warming(hours, duration, c["tau_h"])[d.pose][:, None, None]
+            ),
+        )
+    order = np.sort(data.variables["index"])
+    centre = p.mean(axis=0)
+
+    def moved(d: ObservationData, c: Constants) -> Array:
+        after = (d.variables["index"][d.pose] > c["pose"] - 0.5).astype(float)[:, None, None]
+        arm = _positions(d)
+        turn = np.broadcast_to(np.eye(3), (len(arm), 3, 3))
+        shift = np.concatenate([turn, _cross_columns(arm - centre)], axis=2)
+        return _world(d, shift * after, np.concatenate([np.zeros_like(turn), turn], axis=2) * after)
+
+    yield Family(
+        "camera_moved", "camera", "station", None, ("x", "y", "z", "rx", "ry", "rz"),
+        (1e-3, 1e-3, 1e-3, 5e-4, 5e-4, 5e-4),
+        lambda v, c: {
+            "pose": c["pose"], "shift_mm": [float(x) * 1e3 for x in v[:3]], "turn_deg": [float(x) * DEG for x in v[3:]],
+        },
+        "The station moved before pose {pose}",
+        grid=tuple({"pose": float(i)} for i in order[3:-3]), displace=moved, covariates=("index",),
+    )
+
+
+def _cross_columns(arm: Array) -> Array:
+    """(m, 3, 3): column k is e_k x arm, the displacement by a unit turn about axis k."""
+    return np.cross(np.eye(3)[None, :, :], arm[:, None, :]).swapaxes(1, 2)
+
+
+def _body(data: ObservationData, ids: tuple[int, ...], body: str) -> Iterator[Family]:
+    present = [i for i in ids if np.any(data.target == i)]
+    if len(present) < 2:
+        return
+    for target in present:
+
+        def shifted(d: ObservationData, c: Constants, t: int = target) -> Array:
+            return d.world_T_tool[:, :3, :3] * (d.target == t)[:, None, None]
+
+        yield Family(
+            "target_shifted", "body", str(target), None, ("x", "y", "z"), (5e-4, 5e-4, 5e-4),
+            lambda v, c: {"shift_mm": [float(x) * 1e3 for x in v]},
+            "Target {where} sits at another place than its file says, by {shift_mm} mm",
+            displace=shifted, weight=1.0 / len(present),
+        )
+    for name, values, _ in _times(data):
+
+        def grown(d: ObservationData, c: Constants, v: Array = values) -> Array:
+            return (np.einsum("mij,mj->mi", d.world_T_tool[:, :3, :3], d.p_tool) * v[d.pose][:, None])[:, :, None]
+
+        yield Family(
+            "body_thermal_growth", "body", body, None, ("growth",), (1.5e-5,),
+            lambda v, c: {"um_per_m_K": float(v[0]) * 1e6},
+            "The measuring body {where} grows by {um_per_m_K:.1f} um per metre and kelvin",
+            displace=grown, covariates=(name,),
+        )
+
+
+def _wire() -> Iterator[Family]:
+    def length(d: ObservationData) -> Array:
+        return np.linalg.norm(d.p_world, axis=1)
+
+    def family(cause: str, prior: float, report: str, factor: float, sentence: str, law: object) -> Family:
+        return Family(
+            cause, "wire", "wire", None, ("amount",), (prior,),
+            lambda v, c: {report: float(v[0]) * factor}, sentence,
+            displace=lambda d, c: law(d)[:, None, None],  # type: ignore[operator]
+        )
+
+    def sag(d: ObservationData) -> Array:
+        # parabola: arc - chord = (w L cos)^2 L / (24 H^2), linear in the square of the weight per length
+        horizontal = np.hypot(d.p_world[:, 0], d.p_world[:, 1])
+        return (GRAVITY / STEEL_WIRE_N) ** 2 * horizontal**2 * length(d) / 24.0
+
+    yield replace(
+        family("wire_sag", 1e-6, "g_per_m", 1.0, "The wire sags as one of {g_per_m:.1f} g/m does", sag),
+        report=lambda v, c: {"g_per_m": float(np.sqrt(max(v[0], 0.0))) * 1e3},
+    )
+    yield family("wire_stretch", 1e-4, "ppm_per_m", 1e6, "The wire stretches by {ppm_per_m:.0f} ppm per metre drawn",
+                 lambda d: length(d) ** 2)
+    yield family("wire_scale", 3e-4, "ppm", 1e6, "The wire encoder counts {ppm:.0f} ppm too much", length)
+    yield family("wire_offset", 1e-3, "mm", 1e3, "The wire's zero is off by {mm:.2f} mm",
+                 lambda d: np.ones(len(d.pose)))
+    yield family("pulley_wrap", 5e-3, "radius_mm", 1e3,
+                 "The wire wraps around a pulley of {radius_mm:.1f} mm radius that the model leaves out",
+                 lambda d: np.arctan2(d.p_world[:, 2], np.hypot(d.p_world[:, 0], d.p_world[:, 1])))
+
+
+def _sensor(data: ObservationData, body: str) -> Iterator[Family]:
+    if data.p_sensor is None:
+        return
+    yield Family(
+        "sensor_scale", "sensor", "sensor", None, ("scale",), (1e-3,), lambda v, c: {"ppm": float(v[0]) * 1e6},
+        "The sensor measures {ppm:.0f} ppm too long",
+        displace=lambda d, c: np.einsum("mij,mj->mi", d.world_T_tool[:, :3, :3], d.p_sensor)[:, :, None],
+    )
+    yield Family(
+        "sensor_rotation", "sensor", "sensor", None, ("rx", "ry", "rz"), (2e-3, 2e-3, 2e-3),
+        lambda v, c: {"deg": [float(x) * DEG for x in v]},
+        "The sensor's axes are turned by {deg} deg",
+        displace=lambda d, c: d.world_T_tool[:, :3, :3] @ _cross_columns(_required(d.p_sensor)),
+    )
+    for name, values, _ in _times(data):
+
+        def grown(d: ObservationData, c: Constants, v: Array = values) -> Array:
+            return -(d.p_world * v[d.pose][:, None])[:, :, None]
+
+        yield Family(
+            "sphere_growth", "sensor", body, None, ("growth",), (1e-5,), lambda v, c: {"um_per_m_K": float(v[0]) * 1e6},
+            "The calibration sphere grows by {um_per_m_K:.1f} um per metre and kelvin", displace=grown,
+            covariates=(name,),
+        )
+
+
+def _required(p_sensor: Array | None) -> Array:
+    if p_sensor is None:
+        raise ValueError("sensor coordinates are missing")
+    return p_sensor
+
+
+def describe(sentence: str, where: str, direction: str | None, told: Mapping[str, object]) -> str:
+    """Fill a family's sentence: axis names are spelled out for people, lists shortened to three decimals."""
+    place = where.replace("axis", "axis ") if where.startswith("axis") else where
+    shown = {
+        name: ", ".join(f"{x:.3f}" for x in value) if isinstance(value, list) else value for name, value in told.items()
+    }
+    text = sentence.format(where=place, direction=direction or "", **shown)
+    return text[0].upper() + text[1:]

@@ -1,0 +1,123 @@
+"""Where causes may act on a given robot: its joints, the covariates that were recorded, what is fitted already."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from robcal.physics.family import DEG
+from robcal.robot.model import RobotModel
+from robcal.transforms import Array
+
+ANGLE_OF_AXIS = {"x": "roll", "y": "pitch", "z": "yaw"}
+LETTER_OF_KIND = {"roll": "x", "pitch": "y", "yaw": "z", "x": "x", "y": "y", "z": "z"}
+
+
+@dataclass(frozen=True)
+class Joint:
+    """Joint K (from 1) of the chain, carried by a named frame."""
+
+    number: int
+    frame: str
+    axis: str
+    sign: int
+    prismatic: bool
+
+    @property
+    def where(self) -> str:
+        """Its name in the contract."""
+        return f"axis{self.number}"
+
+    @property
+    def unit(self) -> str:
+        """Unit of the joint coordinate in files."""
+        return "mm" if self.prismatic else "deg"
+
+    @property
+    def factor(self) -> float:
+        """From SI to the unit of files."""
+        return 1e3 if self.prismatic else DEG
+
+    @property
+    def own_angle(self) -> str:
+        """The number of the frame that the joint turns or slides."""
+        return self.axis if self.prismatic else ANGLE_OF_AXIS[self.axis]
+
+    @property
+    def cross_angles(self) -> tuple[str, ...]:
+        """The angles across the joint's own."""
+        return tuple(kind for kind in ("roll", "pitch", "yaw") if kind != self.own_angle)
+
+
+@dataclass(frozen=True)
+class RobotSite:
+    """The robot and the recording, as far as causes need to know them.
+
+    Attributes
+    ----------
+    model : the robot as identified.
+    variables : every variable of the expression language, each (n,), one value per pose.
+    fitted : names of the kernel's parameters that the identification fitted.
+    tied : names that it eliminated because the data cannot tell them from fitted ones.
+    """
+
+    model: RobotModel
+    variables: Mapping[str, Array]
+    fitted: frozenset[str]
+    tied: frozenset[str]
+
+    @property
+    def joints(self) -> tuple[Joint, ...]:
+        """The joints in order."""
+        moving = [frame for frame in self.model.frames if frame.axis is not None]
+        return tuple(
+            Joint(k, frame.name, frame.axis or "", frame.sign, frame.prismatic) for k, frame in enumerate(moving, 1)
+        )
+
+    @property
+    def poses(self) -> int:
+        """Number of poses."""
+        return len(self.variables["index"])
+
+    def varies(self, name: str, least: float = 1e-9) -> bool:
+        """Whether a covariate was recorded and changes by more than `least`."""
+        values = self.variables.get(name)
+        return values is not None and bool(np.ptp(values) > least)
+
+    def temperatures(self) -> tuple[str, ...]:
+        """Recorded temperatures that change by more than 0.2 K, enough to speak of."""
+        return tuple(v for v in self.variables if v.startswith("temp_") and self.varies(v, 0.2))
+
+    def duration_h(self) -> float:
+        """Hours between the first and the last pose; zero without times."""
+        times = self.variables.get("time_s")
+        return 0.0 if times is None else float(np.max(times) - np.min(times)) / 3600.0
+
+
+def time_laws(site: RobotSite) -> list[tuple[str, dict[str, float], str]]:
+    """Covariates of thermal effects: (expression, constants, unit tag 'K' or 'h').
+
+    Time-only effects follow 1 - exp(-t/tau); the expression has the value t_end in hours at the end, so that its
+    coefficient is the total change by the duration.
+    """
+    laws: list[tuple[str, dict[str, float], str]] = []
+    for name in site.temperatures():
+        first = float(site.variables[name][int(np.argmin(site.variables["index"]))])
+        laws.append((f"({name} - {first!r})", {}, name))
+    duration = site.duration_h()
+    if duration > 0:
+        start = float(np.min(site.variables["time_s"]))
+        for share in (0.1, 0.2, 0.4, 0.8, 2.0):
+            laws.append((exponential_law(start, duration, share * duration), {"tau_h": share * duration}, "h"))
+        laws.append((f"((time_s - {start!r})/3600)", {"tau_h": np.inf}, "h"))
+    return laws
+
+
+def exponential_law(start_s: float, duration_h: float, tau_h: float) -> str:
+    """Expression of a warming up that reaches `duration_h` (hours) at the end with time constant `tau_h`."""
+    if not np.isfinite(tau_h):
+        return f"((time_s - {start_s!r})/3600)"
+    scale = duration_h / -np.expm1(-duration_h / tau_h)
+    return f"({scale!r}*(1 - exp(-(time_s - {start_s!r})/{3600.0 * tau_h!r})))"

@@ -1,0 +1,184 @@
+"""Causes in the structure of the robot: links, bearings, geometry held fixed, foundation, gravity, payload, warmth."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from robcal.physics.family import DEG, PER_KNM, Basis, Constants, Family
+from robcal.physics.site import LETTER_OF_KIND, Joint, RobotSite, exponential_law
+from robcal.transforms import Array
+
+
+def structure_families(site: RobotSite) -> Iterator[Family]:
+    """All families of causes outside the joints' own direction of rotation."""
+    joints = list(site.joints)
+    for maker in (_link_compliance, _geometry, _wobble, _growth):
+        families = [family for joint in joints for family in maker(site, joint)]
+        yield from (replace(family, weight=family.weight / len(families)) for family in families)
+    yield from _base(site)
+    yield from _gravity(site)
+    yield from _payloads(site)
+
+
+def _link_compliance(site: RobotSite, joint: Joint) -> Iterator[Family]:
+    for angle in joint.cross_angles if not joint.prismatic else ("roll", "pitch", "yaw"):
+        name = f"{joint.frame}.elastic_{angle}"
+        if name in site.fitted or name in site.tied or not site.varies(f"{joint.frame}_m{angle}", 1.0):
+            continue
+        yield Family(
+            "link_compliance", "robot", joint.where, LETTER_OF_KIND[angle], (name,), (1e-6,),
+            lambda v, c: {"compliance_deg_per_kNm": float(v[0]) * PER_KNM},
+            "The link or bearing of {where} gives way about {direction} by {compliance_deg_per_kNm:.3g} deg/kNm",
+            frees=(name,), covariates=(f"{joint.frame}_m{angle}",),
+        )
+
+
+def _geometry(site: RobotSite, joint: Joint) -> Iterator[Family]:
+    for kind in ("x", "y", "z", "roll", "pitch", "yaw"):
+        name = f"{joint.frame}.{kind}"
+        if name in site.fitted or name in site.tied:
+            continue
+        length = kind in "xyz"
+        unit, factor = ("mm", 1e3) if length else ("deg", DEG)
+
+        def report(v: Array, c: Constants, key: str = f"{kind}_{unit}", scale: float = factor) -> dict[str, object]:
+            return {key: float(v[0]) * scale}
+
+        yield Family(
+            "geometry", "robot", joint.where, LETTER_OF_KIND[kind], (name,), (5e-4,), report,
+            f"The {kind} of {{where}} is off by {{{kind}_{unit}:.4f}} {unit}, which the model held fixed",
+            frees=(name,),
+        )
+
+
+def _wobble(site: RobotSite, joint: Joint) -> Iterator[Family]:
+    if joint.prismatic or not site.varies(f"q{joint.number}", 1e-6):
+        return
+    for angle in joint.cross_angles:
+
+        def bases(c: Constants, kind: str = angle) -> tuple[Basis, ...]:
+            turn = f"{c['order']!r}*q{joint.number}"
+            return (Basis(joint.frame, kind, f"cos({turn})", "cosine"), Basis(joint.frame, kind, f"sin({turn})", "sine"))
+
+        def report(v: Array, c: Constants) -> dict[str, object]:
+            return {
+                "order": int(c["order"]),
+                "amplitude_deg": float(np.hypot(*v)) * DEG,
+                "phase_deg": float(np.degrees(np.arctan2(v[1], v[0]))),
+            }
+
+        yield Family(
+            "axis_wobble", "robot", joint.where, LETTER_OF_KIND[angle], ("cosine", "sine"), (2e-4, 2e-4), report,
+            "The axis of {where} wobbles about {direction} by {amplitude_deg:.4f} deg, {order} times a turn",
+            grid=({"order": 1.0}, {"order": 2.0}, {"order": 3.0}), bases=bases, covariates=(f"q{joint.number}",),
+        )
+
+
+def _growth(site: RobotSite, joint: Joint) -> Iterator[Family]:
+    nominal = site.model.frame(joint.frame).xyz
+    for k, axis in enumerate("xyz"):
+        length = float(nominal[k])
+        if abs(length) < 0.02:
+            continue
+        for name in site.temperatures():
+            first = float(site.variables[name][int(np.argmin(site.variables["index"]))])
+
+            def warm(c: Constants, axis: str = axis, law: str = f"{length!r}*({name} - {first!r})") -> tuple[Basis, ...]:
+                return (Basis(joint.frame, axis, law, "growth"),)
+
+            yield Family(
+                "thermal_growth", "robot", joint.where, axis, ("growth",), (1.5e-5,),
+                lambda v, c: {"um_per_m_K": float(v[0]) * 1e6},
+                "The link of {where} grows along {direction} by {um_per_m_K:.1f} um per metre and kelvin",
+                bases=warm, covariates=(name,),
+            )
+        duration = site.duration_h()
+        if duration > 0:
+            start = float(np.min(site.variables["time_s"]))
+
+            def slow(c: Constants, axis: str = axis, sign: float = np.sign(length)) -> tuple[Basis, ...]:
+                law = exponential_law(start, duration, c["tau_h"])
+                return (Basis(joint.frame, axis, f"{float(sign)!r}*{law}", "growth"),)
+
+            yield Family(
+                "thermal_growth", "robot", joint.where, axis, ("growth",), (2e-4 / duration,),
+                lambda v, c: {"rate_um_per_h": float(v[0]) * 1e6, "tau_h": c["tau_h"]},
+                "The link of {where} grows along {direction} by {rate_um_per_h:.1f} um per hour",
+                grid=tuple({"tau_h": share * duration} for share in (0.1, 0.25, 0.6, 3.0)),
+                continuous={"tau_h": (0.02 * duration, 10.0 * duration)},
+                bases=slow, covariates=("time_s",),
+            )
+
+
+def _base(site: RobotSite) -> Iterator[Family]:
+    if any(site.varies(f"base_m{axis}", 1.0) for axis in "xy"):
+        yield Family(
+            "base_compliance", "robot", "base", None, ("compliance",), (3e-7,),
+            lambda v, c: {"compliance_deg_per_kNm": float(v[0]) * PER_KNM},
+            "The foundation tilts under the overturning moment by {compliance_deg_per_kNm:.3g} deg/kNm",
+            bases=lambda c: (
+                Basis("base", "roll", "base_mx", "compliance"), Basis("base", "pitch", "base_my", "compliance"),
+            ),
+            covariates=("base_mx", "base_my"),
+        )
+    order = np.sort(site.variables["index"])
+    kinds = ("x", "y", "z", "roll", "pitch", "yaw")
+    yield Family(
+        "base_moved", "robot", "base", None, kinds, (1e-3, 1e-3, 1e-3, 5e-4, 5e-4, 5e-4),
+        lambda v, c: {
+            "pose": c["pose"], "shift_mm": [float(x) * 1e3 for x in v[:3]], "turn_deg": [float(x) * DEG for x in v[3:]],
+        },
+        "The base of the robot moved before pose {pose}",
+        grid=tuple({"pose": float(i)} for i in order[3:-3]),
+        bases=lambda c: tuple(Basis("base", kind, f"step(index - {c['pose'] - 0.5!r})", kind) for kind in kinds),
+        covariates=("index",),
+    )
+
+
+def _gravity(site: RobotSite) -> Iterator[Family]:
+    names = ("gravity.tilt_x", "gravity.tilt_y")
+    if any(name in site.fitted for name in names) or not _elastic(site):
+        return
+
+    def report(v: Array, c: Constants) -> dict[str, object]:
+        # a turn (tx, ty) of the downward vector leans it towards x by -ty and towards y by tx
+        return {
+            "tilt_deg": float(np.hypot(*v)) * DEG, "azimuth_deg": float(np.degrees(np.arctan2(v[0], -v[1]))),
+        }
+
+    yield Family(
+        "base_tilt", "robot", "base", None, names, (0.02, 0.02), report,
+        "The base stands {tilt_deg:.2f} deg off the plumb line, which changes the deflections",
+        frees=names,
+    )
+
+
+def _elastic(site: RobotSite) -> bool:
+    return any(".elastic_" in name and value for name, value in site.model.parameters.items())
+
+
+def _payloads(site: RobotSite) -> Iterator[Family]:
+    if not _elastic(site):
+        return
+    for name, payload in site.model.payloads.items():
+        mass_name = f"payload.{name}.mass"
+        if mass_name in site.fitted:
+            continue
+        mass = payload.mass
+        yield Family(
+            "payload_mass", "robot", name, None, (mass_name,), (max(0.15 * mass, 0.5),),
+            lambda v, c, m=mass: {"mass_kg": m + float(v[0])},  # type: ignore[misc]
+            "Payload {where} weighs {mass_kg:.1f} kg, not what the campaign says",
+            frees=(mass_name,),
+        )
+        cog_names = tuple(f"payload.{name}.{axis}" for axis in "xyz")
+        cog = np.array(payload.cog)
+        yield Family(
+            "payload_cog", "robot", name, None, cog_names, (0.1, 0.1, 0.1),
+            lambda v, c, g=cog: {"cog_mm": [float(x) * 1e3 for x in g + v]},  # type: ignore[misc]
+            "The centre of gravity of payload {where} lies at {cog_mm} mm, not where the campaign says",
+            frees=cog_names,
+        )
