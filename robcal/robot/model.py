@@ -16,7 +16,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
@@ -102,7 +101,7 @@ class Term:
 
     def __post_init__(self) -> None:
         for name in ("parameters", "units", "priors"):
-            object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
+            object.__setattr__(self, name, dict(getattr(self, name)))
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
@@ -139,8 +138,8 @@ class RobotModel:
     def __post_init__(self) -> None:
         object.__setattr__(self, "frames", tuple(self.frames))
         object.__setattr__(self, "terms", tuple(self.terms))
-        object.__setattr__(self, "parameters", MappingProxyType(dict(self.parameters)))
-        object.__setattr__(self, "payloads", MappingProxyType(dict(self.payloads)))
+        object.__setattr__(self, "parameters", dict(self.parameters))
+        object.__setattr__(self, "payloads", dict(self.payloads))
         for name in ("world_T_base", "flange_T_tool"):
             value = getattr(self, name)
             if value is not None:

@@ -1,0 +1,144 @@
+"""Numeric inverse kinematics for any chain: damped least squares from many starts, deterministic.
+
+Source of the damping: Levenberg-Marquardt on the twist ``difference(K(q), F)``, as in Sugihara (2011), *Solvability-
+unconcerned inverse kinematics*; all poses and starts advance together.
+
+Weakness: a multi-start search finds all branches only with high probability; for redundant arms the solutions are a
+continuum of which the one near each start is found.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import qmc
+
+from robcal.robot.chain import Chain, forward_and_jacobian
+from robcal.transforms import Array, difference
+
+
+@dataclass(frozen=True)
+class NumericSettings:
+    """Settings of the numeric inverse.
+
+    Attributes
+    ----------
+    starts : number of start configurations for a search of all branches.
+    iterations : most steps from one start.
+    tolerance : norm of the weighted twist at which a frame counts as reached, m.
+    rotation_length : m; one radian of rotation counts as much as this length.
+    """
+
+    starts: int = 48
+    iterations: int = 80
+    tolerance: float = 1e-9
+    rotation_length: float = 0.3
+
+
+def start_configurations(chain: Chain, count: int) -> Array:
+    """Deterministic starts (count, N) spread over the limits (unknown limits: one turn, one metre)."""
+    half = np.where(chain.prismatic, 1.0, np.pi)
+    lower = np.where(np.isfinite(chain.lower), chain.lower, -half)
+    upper = np.where(np.isfinite(chain.upper), chain.upper, half)
+    # more than one turn of a joint holds no further branch
+    centre, span = 0.5 * (lower + upper), upper - lower
+    span = np.where(chain.prismatic, span, np.minimum(span, 2.0 * np.pi))
+    unit = qmc.Halton(chain.n_joints, scramble=True, rng=np.random.default_rng(20060101)).random(count)
+    return centre + (unit - 0.5) * span
+
+
+def refine(
+    chain: Chain, base_T_flange: Array, start: Array, settings: NumericSettings, *, within_limits: bool = False
+) -> tuple[Array, Array]:
+    """Joint values (n, N) that bring each row's flange as near as possible to its frame, and the twist left (n, 6).
+
+    ``within_limits`` keeps every step inside the joint limits (a projected step), for the nearest reachable pose.
+    """
+    q = np.array(start, dtype=float)
+    if within_limits:
+        q = np.clip(q, chain.lower, chain.upper)
+    weight = np.array([1.0] * 3 + [settings.rotation_length] * 3)
+    damping = np.full(len(q), 1e-3)
+    T, J = forward_and_jacobian(chain, q)
+    r = difference(T, base_T_flange)
+    cost = np.sum((weight * r) ** 2, axis=1)
+    active = np.arange(len(q))
+    eye = np.eye(chain.n_joints)
+    for _ in range(settings.iterations):
+        active = active[cost[active] > (0.01 * settings.tolerance) ** 2]
+        active = active[damping[active] < 1e8]
+        if not len(active):
+            break
+        Jw = weight[:, None] * J[active]
+        normal = np.swapaxes(Jw, 1, 2) @ Jw
+        gradient = np.einsum("nji,nj->ni", Jw, weight * r[active])
+        if within_limits:
+            # joints that rest on a limit and are pushed against it take no part in this step
+            held = ((q[active] <= chain.lower) & (gradient < 0)) | ((q[active] >= chain.upper) & (gradient > 0))
+            gradient = np.where(held, 0.0, gradient)
+            normal = np.where(held[:, :, None] | held[:, None, :], 0.0, normal)
+        scale = damping[active] * np.maximum(np.sqrt(cost[active]), 1e-12) + 1e-14
+        step = np.linalg.solve(normal + scale[:, None, None] * eye, gradient[..., None])[..., 0]
+        largest = np.max(np.abs(step), axis=1, keepdims=True)
+        trial = q[active] + step * np.minimum(1.0, 1.0 / np.maximum(largest, 1e-300))
+        if within_limits:
+            trial = np.clip(trial, chain.lower, chain.upper)
+        T_new, J_new = forward_and_jacobian(chain, trial)
+        r_new = difference(T_new, base_T_flange[active])
+        cost_new = np.sum((weight * r_new) ** 2, axis=1)
+        better = cost_new < cost[active]
+        rows = active[better]
+        q[rows], r[rows], J[rows], cost[rows] = trial[better], r_new[better], J_new[better], cost_new[better]
+        damping[active] = np.where(better, np.maximum(damping[active] * 0.2, 1e-9), damping[active] * 8.0)
+    return q, r
+
+
+def search(
+    chain: Chain, base_T_flange: Array, near: Array, settings: NumericSettings, *, all_branches: bool
+) -> tuple[Array, Array]:
+    """Solutions (n, B, N), padded with NaN, and whether they are complete searches (n,).
+
+    The start near the given configuration comes first; further starts are spent on rows it does not solve, or on all
+    rows with ``all_branches``.
+    """
+    n, count = len(base_T_flange), chain.n_joints
+    q, r = refine(chain, base_T_flange, near, settings)
+    solved = _norm(r, settings) < settings.tolerance
+    inside = np.all((q >= chain.lower - 1e-9) & (q <= chain.upper + 1e-9), axis=1)
+    rows = np.arange(n) if all_branches else np.flatnonzero(~(solved & inside))
+    found: list[list[Array]] = [[q[i]] if solved[i] else [] for i in range(n)]
+    if len(rows):
+        starts = start_configurations(chain, settings.starts)
+        many = np.repeat(rows, len(starts))
+        q_many, r_many = refine(chain, base_T_flange[many], np.tile(starts, (len(rows), 1)), settings)
+        good = _norm(r_many, settings) < settings.tolerance
+        for i, solution in zip(many[good], q_many[good], strict=True):
+            if not any(_same(chain, solution, known) for known in found[i]):
+                found[i].append(solution)
+    width = max(1, max((len(f) for f in found), default=1))
+    out = np.full((n, width, count), np.nan)
+    for i, solutions in enumerate(found):
+        for k, solution in enumerate(solutions):
+            out[i, k] = solution
+    return out, solved
+
+
+def nearest_pose(chain: Chain, base_T_flange: Array, near: Array, settings: NumericSettings) -> tuple[Array, Array]:
+    """Joint values within the limits whose flange comes nearest to one frame (4, 4), and the twist left (6,)."""
+    starts = np.vstack([near[None], start_configurations(chain, settings.starts)])
+    frames = np.broadcast_to(base_T_flange, (len(starts), 4, 4))
+    q, r = refine(chain, frames, starts, settings, within_limits=True)
+    best = int(np.argmin(_norm(r, settings)))
+    return q[best], r[best]
+
+
+def _norm(r: Array, settings: NumericSettings) -> Array:
+    weight = np.array([1.0] * 3 + [settings.rotation_length] * 3)
+    return np.linalg.norm(weight * r, axis=-1)
+
+
+def _same(chain: Chain, a: Array, b: Array) -> bool:
+    gap = a - b
+    gap = np.where(chain.prismatic, gap, np.angle(np.exp(1j * gap)))
+    return bool(np.max(np.abs(gap)) < 1e-5)

@@ -1,0 +1,296 @@
+"""Fast evaluation of a robot for many poses: tool frames, exact Jacobians, moments.
+
+The graph comes from :mod:`robcal.robot.kernel_graph`; here it is compiled to CasADi functions, mapped over poses, and
+fed with numpy arrays without copying.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from robcal.errors import InvalidInput
+from robcal.robot.kernel_graph import PoseGraph, pose_graph
+from robcal.robot.model import GEOMETRIC_KINDS, RobotModel, parameter_names
+from robcal.robot.statics import moment_names
+from robcal.robot.terms import identifier
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class PoseInputs:
+    """What was commanded and recorded at n poses.
+
+    Attributes
+    ----------
+    q : joint angles (n, N) in the sense of q, rad or m.
+    load : one-hot (n, number of payloads); a row of zeros is no payload.
+    covariates : further columns (n,) by name (``time_s``, ``temp_base_c``, ``approach1``, ...).
+    """
+
+    q: Array
+    load: Array
+    covariates: Mapping[str, Array] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.q)
+
+    def subset(self, rows: ArrayLike) -> PoseInputs:
+        """The poses of the given rows (indices or mask)."""
+        chosen = np.asarray(rows)
+        return PoseInputs(self.q[chosen], self.load[chosen], {k: v[chosen] for k, v in self.covariates.items()})
+
+    def with_q(self, q: ArrayLike) -> PoseInputs:
+        """The same poses with other joint angles (n, N)."""
+        return PoseInputs(np.ascontiguousarray(q, dtype=float), self.load, self.covariates)
+
+
+@dataclass(frozen=True)
+class ScanBasis:
+    """How each coordinate of each frame moves the tool.
+
+    Attributes
+    ----------
+    names : ``<frame>.<kind>``; kinds x, y, z, roll, pitch, yaw and, for joints, q (in the sense of q).
+    J : (n, 6, k) right twist (rho, omega) of the tool per unit of the coordinate, the moments' change included.
+    """
+
+    names: tuple[str, ...]
+    J: Array
+
+
+class Kernel:
+    """A model ready to be evaluated.
+
+    Parameters
+    ----------
+    model : the robot; its parameters become ``theta0``.
+    statics : 'one_step' (moments of the chain before it gives way) or 'converged'.
+
+    Attributes
+    ----------
+    names : all parameter names, in the order of theta (p,).
+    theta0 : values of the model's own parameters.
+    world_T_base, flange_T_tool : references (identity where the model has none).
+
+    Raises
+    ------
+    InvalidInput : unknown statics, or a term outside the expression language.
+    """
+
+    def __init__(self, model: RobotModel, statics: str = "one_step") -> None:
+        self.model = model
+        self.statics = statics
+        self.names = parameter_names(model)
+        self.index = {name: k for k, name in enumerate(self.names)}
+        self.theta0 = self._start(model)
+        self.world_T_base = np.eye(4) if model.world_T_base is None else np.array(model.world_T_base)
+        self.flange_T_tool = np.eye(4) if model.flange_T_tool is None else np.array(model.flange_T_tool)
+        self._graph: PoseGraph | None = None
+        self._functions: dict[str, ca.Function] = {}
+        self._mapped: dict[tuple[str, int], Any] = {}
+        self.covariates = self.graph().covariates
+
+    def with_references(self, world_T_base: ArrayLike | None = None, flange_T_tool: ArrayLike | None = None) -> Kernel:
+        """The same kernel with other references; shares the compiled graph."""
+        other = object.__new__(Kernel)
+        other.__dict__.update(self.__dict__)
+        if world_T_base is not None:
+            other.world_T_base = np.array(world_T_base, dtype=float)
+        if flange_T_tool is not None:
+            other.flange_T_tool = np.array(flange_T_tool, dtype=float)
+        return other
+
+    def graph(self) -> PoseGraph:
+        """The symbolic graph of one pose."""
+        if self._graph is None:
+            self._graph = pose_graph(self.model, self.statics)
+        return self._graph
+
+    def poses(
+        self,
+        q: ArrayLike,
+        payload: Sequence[str | None] | str | None = None,
+        covariates: Mapping[str, ArrayLike] | None = None,
+    ) -> PoseInputs:
+        """Check and arrange pose data.
+
+        Parameters
+        ----------
+        q : (n, N) joint angles, rad or m.
+        payload : name per pose, one name for all, or None; '' and None are no payload.
+        covariates : columns (n,) by name; names that are not identifiers get underscores.
+
+        Raises
+        ------
+        InvalidInput : wrong number of joints, non-finite values, an unknown payload, or columns of another length.
+        """
+        angles = np.atleast_2d(np.ascontiguousarray(q, dtype=float))
+        if angles.ndim != 2 or angles.shape[1] != self.model.n_joints:
+            raise InvalidInput(
+                f"robot '{self.model.name}' has {self.model.n_joints} joints, the poses give {angles.shape[-1]} angles"
+            )
+        bad = np.flatnonzero(~np.all(np.isfinite(angles), axis=1))
+        if bad.size:
+            raise InvalidInput(f"pose {bad[0]} (counted from 0) has a joint angle that is not finite: remove the row")
+        n = len(angles)
+        names = [payload] * n if payload is None or isinstance(payload, str) else list(payload)
+        if len(names) != n:
+            raise InvalidInput(f"{len(names)} payload names for {n} poses")
+        load = np.zeros((n, len(self.model.payloads)))
+        columns = {name: k for k, name in enumerate(self.model.payloads)}
+        for row, name in enumerate(names):
+            if name is None or name == "" or name != name:
+                continue
+            if name not in columns:
+                known = ", ".join(columns) or "none"
+                raise InvalidInput(f"pose {row} (counted from 0) carries unknown payload '{name}'; known: {known}")
+            load[row, columns[name]] = 1.0
+        table: dict[str, Array] = {}
+        for name, values in (covariates or {}).items():
+            column = np.asarray(values, dtype=float)
+            if column.shape != (n,):
+                raise InvalidInput(f"covariate '{name}' has {column.shape} values for {n} poses")
+            table[identifier(name)] = column
+        table.setdefault("index", np.arange(n, dtype=float))
+        return PoseInputs(angles, load, table)
+
+    def frames(self, theta: ArrayLike, poses: PoseInputs) -> Array:
+        """Tool frames ``world_T_tool`` (n, 4, 4)."""
+        (flat,) = self._evaluate("frames", theta, poses)
+        return _matrices(flat)
+
+    def frames_and_jacobian(
+        self, theta: ArrayLike, poses: PoseInputs, columns: ArrayLike | None = None
+    ) -> tuple[Array, Array]:
+        """Tool frames (n, 4, 4) and their right twist (n, 6, p) per parameter; ``columns`` picks parameters by index."""
+        flat, jacobian = self._evaluate("jacobian", theta, poses)
+        J = jacobian.reshape(len(poses), len(self.names), 6)
+        if columns is not None:
+            J = J[:, np.asarray(columns)]
+        return _matrices(flat), J.transpose(0, 2, 1)
+
+    def joint_jacobian(self, theta: ArrayLike, poses: PoseInputs) -> Array:
+        """Right twist (n, 6, N) of the tool per unit of each joint."""
+        (flat,) = self._evaluate("joint_jacobian", theta, poses)
+        return flat.reshape(len(poses), self.model.n_joints, 6).transpose(0, 2, 1)
+
+    def scan_basis(self, theta: ArrayLike, poses: PoseInputs) -> ScanBasis:
+        """Tool twists of every coordinate of base, chain and tool, and of every joint."""
+        (flat,) = self._evaluate("basis", theta, poses)
+        frames = ["base", *(f.name for f in self.model.frames), "tool"]
+        names = [f"{frame}.{kind}" for frame in frames for kind in GEOMETRIC_KINDS]
+        J = flat.reshape(len(poses), len(names), 6).transpose(0, 2, 1)
+        joints = [(names.index(f"{f.name}.{f.joint_kind}"), f.sign, f"{f.name}.q") for f in self.model.joints]
+        of_joints = J[:, :, [k for k, _, _ in joints]] * np.array([s for _, s, _ in joints], dtype=float)
+        return ScanBasis((*names, *(n for _, _, n in joints)), np.concatenate([J, of_joints], axis=2))
+
+    def variables(self, theta: ArrayLike, poses: PoseInputs) -> dict[str, Array]:
+        """All variables of the expression language, (n,) each: q, moments, torques, payload mass, covariates."""
+        (flat,) = self._evaluate("moments", theta, poses)
+        names = moment_names(self.model)
+        out: dict[str, Array] = {name: flat[:, k] for k, name in enumerate(names)}
+        for k, f in enumerate(self.model.joints):
+            out[f"q{k + 1}"] = poses.q[:, k]
+            own = f"{identifier(f.name)}_force" if f.prismatic else f"{identifier(f.name)}_m{f.joint_kind}"
+            out[f"torque{k + 1}"] = f.sign * out[own]
+            out[f"approach{k + 1}"] = np.zeros(len(poses))
+        masses = [p.mass + np.asarray(theta)[self.index[f"payload.{n}.mass"]] for n, p in self.model.payloads.items()]
+        out["payload_mass"] = poses.load @ np.array(masses) if masses else np.zeros(len(poses))
+        return {**out, **poses.covariates}
+
+    def theta(self, values: Mapping[str, float]) -> Array:
+        """``theta0`` with the named values replaced.
+
+        Raises
+        ------
+        InvalidInput : unknown name.
+        """
+        theta = self.theta0.copy()
+        for name, value in values.items():
+            if name not in self.index:
+                raise InvalidInput(f"robot '{self.model.name}' has no parameter '{name}'")
+            theta[self.index[name]] = value
+        return theta
+
+    def function(self, kind: str = "frames") -> ca.Function:
+        """CasADi function of one pose: 'frames', 'jacobian' (with frames), 'joint_jacobian', 'basis' or 'moments'.
+
+        Inputs: theta, q, load, covariates, world_T_base (3, 4), flange_T_tool (3, 4).
+        """
+        if kind not in self._functions:
+            g = self.graph()
+            outputs = {
+                "frames": [g.world_T_tool],
+                "jacobian": [g.world_T_tool, g.jacobian],
+                "joint_jacobian": [g.joint_jacobian],
+                "basis": [g.basis],
+                "moments": [g.moments],
+            }[kind]
+            self._functions[kind] = ca.Function(f"robot_{kind}", g.inputs, [ca.densify(o) for o in outputs])
+        return self._functions[kind]
+
+    def _start(self, model: RobotModel) -> Array:
+        values = dict(model.parameters)
+        for term in model.terms:
+            for short, value in term.parameters.items():
+                full = f"{term.name}.{short}"
+                if values.setdefault(full, value) != value:
+                    raise InvalidInput(f"terms named '{term.name}' share '{short}' but give it different values")
+        return np.array([values.get(name, 0.0) for name in self.names])
+
+    def _covariate_table(self, poses: PoseInputs) -> Array:
+        table = np.zeros((len(poses), len(self.covariates)))
+        for k, name in enumerate(self.covariates):
+            if name in poses.covariates:
+                table[:, k] = poses.covariates[name]
+            elif not (name.startswith("approach") and name[8:].isdigit()):
+                raise InvalidInput(f"a term of robot '{self.model.name}' needs the column '{name}', the poses have none")
+        return table
+
+    def _evaluate(self, kind: str, theta: ArrayLike, poses: PoseInputs) -> list[Array]:
+        """Run a function over all poses; each output as (n, entries) in CasADi's column-major order."""
+        n = len(poses)
+        function = self.function(kind)
+        if n == 0:
+            return [np.zeros((0, function.numel_out(k))) for k in range(function.n_out())]
+        key = (kind, n)
+        if key not in self._mapped:
+            mapped = function.map(f"robot_{kind}_{n}", "serial", n, [0, 4, 5], [])
+            self._mapped[key] = (mapped, *mapped.buffer())
+        _, buffer, run = self._mapped[key]
+        arguments = [
+            np.ascontiguousarray(theta, dtype=float), np.ascontiguousarray(poses.q), np.ascontiguousarray(poses.load),
+            self._covariate_table(poses), np.asfortranarray(self.world_T_base[:3]).ravel(order="F"),
+            np.asfortranarray(self.flange_T_tool[:3]).ravel(order="F"),
+        ]
+        if arguments[0].shape != (len(self.names),):
+            raise InvalidInput(f"theta has {arguments[0].size} values, the model has {len(self.names)} parameters")
+        results = [np.empty((n, function.numel_out(k))) for k in range(function.n_out())]
+        for k, array in enumerate(arguments):
+            if array.size:
+                buffer.set_arg(k, memoryview(array))
+        for k, array in enumerate(results):
+            buffer.set_res(k, memoryview(array))
+        run()
+        return results
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"model": self.model, "statics": self.statics}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__init__(state["model"], state["statics"])  # type: ignore[misc]
+
+
+def _matrices(flat: Array) -> Array:
+    """(n, 12) column-major (3, 4) blocks to (n, 4, 4)."""
+    T = np.zeros((len(flat), 4, 4))
+    T[:, :3] = flat.reshape(-1, 4, 3).transpose(0, 2, 1)
+    T[:, 3, 3] = 1.0
+    return T

@@ -1,0 +1,255 @@
+"""The CasADi graph of a robot for one pose: tool frame, moments, and exact right-twist Jacobians.
+
+Every frame (base, chain, tool) has six coordinates ``c = nominal + deviation + sign q + elasticity * moment + terms``.
+A change of a coordinate moves the tool by a geometric twist column G; what a parameter does to the coordinates, directly
+and by way of the moments, is D + S dm. So ``J = G D + (G S) dm/dtheta``: only D and S (small and sparse) come from
+automatic differentiation, G and the moments' derivatives from mechanics. That keeps the graph ten times smaller than
+differentiating the chain.
+
+Statics 'one_step': moments of the chain before it gives way, as in the thesis (section 3.4). 'converged': the fixed
+point, unrolled; each round gains the factor elasticity * load, about 1e-2 for soft robots.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+
+from robcal.errors import InvalidInput
+from robcal.robot.model import ELASTIC_KINDS, GEOMETRIC_KINDS, RobotModel, parameter_names
+from robcal.robot.statics import StaticChain, local_frame, moment_names, moment_sweep, moments, static_chain
+from robcal.robot.terms import graph, identifier, names_in
+
+CONVERGED_ROUNDS = 8
+_SIX = {kind: k for k, kind in enumerate(GEOMETRIC_KINDS)}
+
+
+@dataclass(frozen=True)
+class PoseGraph:
+    """Graphs of one pose.
+
+    Attributes
+    ----------
+    inputs : theta, q (sense of q), load (one-hot over payloads), covariates, world_T_base (12,), flange_T_tool (12,).
+    covariates : names of the covariates that the terms need, in order.
+    world_T_tool : (3, 4).
+    jacobian : (6, p) by all parameters; joint_jacobian (6, N); basis (6, coordinates): tool twist per coordinate.
+    moments : entries as :func:`robcal.robot.statics.moment_names`.
+    """
+
+    inputs: list[ca.SX]
+    covariates: tuple[str, ...]
+    world_T_tool: ca.SX
+    jacobian: ca.SX
+    joint_jacobian: ca.SX
+    basis: ca.SX
+    moments: ca.SX
+
+
+def pose_graph(model: RobotModel, statics: str = "one_step", derivatives: bool = True) -> PoseGraph:
+    """Build the graph of a model.
+
+    Raises
+    ------
+    InvalidInput : unknown statics, or a term whose expression names something unknown.
+    """
+    if statics not in ("one_step", "converged"):
+        raise InvalidInput(f"statics must be one_step or converged, not '{statics}'")
+    names = parameter_names(model)
+    index = {name: k for k, name in enumerate(names)}
+    n, n_q = len(model.frames), model.n_joints
+    theta, q = ca.SX.sym("theta", len(names)), ca.SX.sym("q", n_q)
+    load = ca.SX.sym("load", len(model.payloads))
+    covariate_names = _covariates(model)
+    covariates = ca.SX.sym("covariates", len(covariate_names))
+    W0, F0 = ca.SX.sym("world_T_base", 3, 4), ca.SX.sym("flange_T_tool", 3, 4)
+    inputs = [theta, q, load, covariates, W0, F0]
+
+    load_mass, load_moment, load_columns = _load(model, theta, index, load)
+    m = ca.SX.sym("m", len(moment_names(model)))
+    coordinates = _coordinates(model, theta, q, m, covariates, covariate_names, load_mass, index)
+    at_rest = ca.substitute(coordinates, m, ca.SX.zeros(m.shape))
+
+    g0, tilt_columns = _gravity(model, theta, index)
+    world_gravity = model.gravity_frame == "world"
+
+    def chain_at(c: ca.SX) -> StaticChain:
+        g = g0
+        if world_gravity:
+            R_base = ca.mtimes(W0[:, :3], local_frame(c[:6]).R)
+            g = ca.mtimes(R_base.T, g0)
+        return static_chain(model, [c[6 * (i + 1) : 6 * (i + 2)] for i in range(n)], g, load_mass, load_moment)
+
+    chain = chain_at(at_rest)
+    moment = moments(model, chain)
+    coupled = bool(ca.depends_on(coordinates, m))
+    if statics == "converged" and coupled:
+        for _ in range(CONVERGED_ROUNDS):
+            chain = chain_at(ca.substitute(coordinates, m, moment))
+            moment = moments(model, chain)
+    deflected = ca.substitute(coordinates, m, moment) if coupled else coordinates
+    tool = _tool_chain(deflected, n, W0, F0)
+    world_T_tool = ca.horzcat(tool.tool_R_world.T, -ca.mtimes(tool.tool_R_world.T, tool.world_origin))
+    if not derivatives:
+        empty = ca.SX()
+        return PoseGraph(inputs, covariate_names, world_T_tool, empty, empty, empty, moment)
+
+    G = tool.columns
+    unknowns = ca.vertcat(theta, q)
+    D = ca.jacobian(coordinates, unknowns)
+    S = ca.jacobian(coordinates, m)
+    D, S, D_rest = (ca.substitute(D, m, moment), ca.substitute(S, m, moment),
+                    ca.substitute(D, m, ca.SX.zeros(m.shape))) if coupled else (D, S, D)
+    base_lines = _base_lines(at_rest[:6] if statics == "one_step" else deflected[:6])
+
+    def feedback(W: ca.SX) -> tuple[ca.SX, ca.SX]:
+        """K: derivative of W m by all coordinates; L: by the unknowns at fixed coordinates."""
+        sweep = moment_sweep(model, chain, W)
+        K_base = ca.SX(6, 6)
+        if world_gravity:
+            K_base = ca.horzcat(
+                ca.SX(6, 3), *(ca.mtimes(sweep.by_gravity, ca.cross(chain.g, line)) for line in base_lines)
+            )
+        K = ca.horzcat(K_base, sweep.by_coordinate, ca.SX(6, 6))
+        L = ca.SX(6, unknowns.numel())
+        base_R = ca.mtimes(W0[:, :3], local_frame(at_rest[:6]).R) if world_gravity else ca.SX.eye(3)
+        for k, dg in tilt_columns.items():
+            L[:, k] = ca.mtimes(sweep.by_gravity, ca.mtimes(base_R.T, dg))
+        for k, (d_mass, d_moment) in load_columns.items():
+            L[:, k] = sweep.by_mass * d_mass + ca.mtimes(sweep.by_first, ca.mtimes(chain.rotations[-1], d_moment))
+        return K, L
+
+    if not coupled:
+        J, basis = ca.mtimes(G, D), G
+    elif statics == "one_step":
+        K, L = feedback(ca.mtimes(G, S))
+        J, basis = ca.mtimes(G, D) + ca.mtimes(K, D_rest) + L, G + K
+    else:
+        basis = G
+        for _ in range(CONVERGED_ROUNDS):
+            K, L = feedback(ca.mtimes(basis, S))
+            basis = G + K
+        J = ca.mtimes(basis, D) + L
+    p = theta.numel()
+    return PoseGraph(inputs, covariate_names, world_T_tool, J[:, :p], J[:, p:], basis, moment)
+
+
+def expression_variables(model: RobotModel) -> frozenset[str]:
+    """Names that the kernel supplies to expressions; all others are covariates."""
+    joints = range(1, model.n_joints + 1)
+    return frozenset(
+        [f"q{k}" for k in joints] + [f"torque{k}" for k in joints] + moment_names(model) + ["payload_mass"]
+    )
+
+
+def _covariates(model: RobotModel) -> tuple[str, ...]:
+    known = expression_variables(model)
+    found: dict[str, None] = {}
+    for term in model.terms:
+        for name in sorted(names_in(term.expression) - set(term.parameters) - known):
+            found[name] = None
+    return tuple(found)
+
+
+def _load(model: RobotModel, theta: ca.SX, index: dict[str, int], load: ca.SX) -> tuple:
+    """Mass and first moment of what hangs on the flange, and their derivatives by each payload parameter."""
+    mass, moment = ca.SX(0), ca.SX.zeros(3)
+    columns: dict[int, tuple[ca.SX, ca.SX]] = {}
+    for k, (name, payload) in enumerate(model.payloads.items()):
+        at = index[f"payload.{name}.mass"]
+        own_mass = payload.mass + theta[at]
+        cog = ca.DM(payload.cog) + theta[at + 1 : at + 4]
+        mass = mass + load[k] * own_mass
+        moment = moment + load[k] * own_mass * cog
+        columns[at] = (load[k], load[k] * cog)
+        for axis in range(3):
+            columns[at + 1 + axis] = (ca.SX(0), load[k] * own_mass * ca.SX.eye(3)[:, axis])
+    return mass, moment, columns
+
+
+def _gravity(model: RobotModel, theta: ca.SX, index: dict[str, int]) -> tuple[ca.SX, dict[int, ca.SX]]:
+    """Gravity ``Rx(tilt_x) Ry(tilt_y) g0`` in its own frame and its derivatives by the two tilts."""
+    tilt = [index["gravity.tilt_x"], index["gravity.tilt_y"]]
+    cx, sx, cy, sy = ca.cos(theta[tilt[0]]), ca.sin(theta[tilt[0]]), ca.cos(theta[tilt[1]]), ca.sin(theta[tilt[1]])
+    Rx = ca.vertcat(ca.horzcat(1, 0, 0), ca.horzcat(0, cx, -sx), ca.horzcat(0, sx, cx))
+    Ry = ca.vertcat(ca.horzcat(cy, 0, sy), ca.horzcat(0, 1, 0), ca.horzcat(-sy, 0, cy))
+    g = ca.mtimes(Rx, ca.mtimes(Ry, ca.DM(model.gravity)))
+    by_x = ca.cross(ca.DM([1, 0, 0]), g)
+    by_y = ca.mtimes(Rx, ca.cross(ca.DM([0, 1, 0]), ca.mtimes(Ry, ca.DM(model.gravity))))
+    return g, {tilt[0]: by_x, tilt[1]: by_y}
+
+
+def _coordinates(
+    model: RobotModel, theta: ca.SX, q: ca.SX, m: ca.SX, covariates: ca.SX, covariate_names: tuple[str, ...],
+    load_mass: ca.SX, index: dict[str, int],
+) -> ca.SX:
+    """Six coordinates of base, every frame, and tool; the moments enter as symbols."""
+    at = {"base": 0, "tool": 6 * (len(model.frames) + 1)} | {f.name: 6 * (i + 1) for i, f in enumerate(model.frames)}
+    values: list[ca.SX] = [theta[index[f"base.{k}"]] for k in GEOMETRIC_KINDS]
+    joint = 0
+    for i, f in enumerate(model.frames):
+        for k, (kind, nominal) in enumerate(zip(GEOMETRIC_KINDS, (*f.xyz, *f.rpy), strict=True)):
+            value = nominal + theta[index[f"{f.name}.{kind}"]]
+            if kind == f.joint_kind:
+                value = value + f.sign * q[joint]
+            if k >= 3:
+                value = value + theta[index[f"{f.name}.{ELASTIC_KINDS[k - 3]}"]] * m[3 + 3 * i + k - 3]
+            values.append(value)
+        joint += f.axis is not None
+    values += [theta[index[f"tool.{k}"]] for k in GEOMETRIC_KINDS]
+
+    if model.terms:
+        symbols = _symbols(model, q, m, load_mass) | {c: covariates[k] for k, c in enumerate(covariate_names)}
+        for term in model.terms:
+            own = {short: theta[index[f"{term.name}.{short}"]] for short in term.parameters}
+            value = graph(term.expression, {**symbols, **own})
+            kind = term.kind
+            if kind == "q":
+                f = model.frame(term.frame)
+                kind, value = str(f.joint_kind), f.sign * value
+            values[at[term.frame] + _SIX[kind]] += value
+    return ca.vertcat(*values)
+
+
+def _symbols(model: RobotModel, q: ca.SX, m: ca.SX, load_mass: ca.SX) -> dict[str, ca.SX]:
+    names = moment_names(model)
+    symbols = {name: m[k] for k, name in enumerate(names)}
+    for k, f in enumerate(model.joints):
+        symbols[f"q{k + 1}"] = q[k]
+        own = f"{identifier(f.name)}_force" if f.prismatic else f"{identifier(f.name)}_m{f.joint_kind}"
+        symbols[f"torque{k + 1}"] = f.sign * m[names.index(own)]
+    symbols["payload_mass"] = load_mass
+    return symbols
+
+
+@dataclass(frozen=True)
+class _ToolChain:
+    tool_R_world: ca.SX
+    world_origin: ca.SX
+    columns: ca.SX
+
+
+def _tool_chain(c: ca.SX, n: int, W0: ca.SX, F0: ca.SX) -> _ToolChain:
+    """From the tool inwards, all in tool coordinates: ``rho = o x z`` for a turn about z through o, ``omega = z``."""
+    R, o = ca.SX.eye(3), ca.SX.zeros(3)  # rotation and origin of the frame reached, seen from the tool
+    blocks: list[ca.SX] = []
+    for i in reversed(range(n + 2)):
+        local = local_frame(c[6 * i : 6 * i + 6])
+        R_parent = ca.mtimes(R, local.R.T)
+        lines = ca.horzcat(R[:, 0], ca.mtimes(R_parent, local.pitch_line), R_parent[:, 2])
+        turning = ca.horzcat(*(ca.cross(o, lines[:, k]) for k in range(3)))
+        blocks.append(ca.horzcat(ca.vertcat(R_parent, ca.SX(3, 3)), ca.vertcat(turning, lines)))
+        o = o - ca.mtimes(R_parent, local.t)
+        R = R_parent
+        reference = F0 if i == n + 1 else W0 if i == 0 else None
+        if reference is not None:
+            R = ca.mtimes(R, reference[:, :3].T)
+            o = o - ca.mtimes(R, reference[:, 3])
+    return _ToolChain(R, o, ca.horzcat(*reversed(blocks)))
+
+
+def _base_lines(six: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
+    """Directions, in base coordinates, about which roll, pitch, yaw of the base turn."""
+    local = local_frame(six)
+    return ca.SX.eye(3)[:, 0], ca.mtimes(local.R.T, local.pitch_line), local.R[2, :].T
