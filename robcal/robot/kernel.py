@@ -44,6 +44,7 @@ class PoseInputs:
     def subset(self, rows: ArrayLike) -> PoseInputs:
         """The poses of the given rows (indices or mask)."""
         chosen = np.asarray(rows)
+        chosen = chosen if chosen.dtype == bool else chosen.astype(np.intp)
         return PoseInputs(self.q[chosen], self.load[chosen], {k: v[chosen] for k, v in self.covariates.items()})
 
     def with_q(self, q: ArrayLike) -> PoseInputs:
@@ -169,7 +170,7 @@ class Kernel:
     def frames_and_jacobian(
         self, theta: ArrayLike, poses: PoseInputs, columns: ArrayLike | None = None
     ) -> tuple[Array, Array]:
-        """Tool frames (n, 4, 4) and their right twist (n, 6, p) per parameter; ``columns`` picks parameters by index."""
+        """Tool frames (n, 4, 4) and right twists (n, 6, p) per parameter; ``columns`` picks parameters by index."""
         flat, jacobian = self._evaluate("jacobian", theta, poses)
         J = jacobian.reshape(len(poses), len(self.names), 6)
         if columns is not None:
@@ -251,7 +252,7 @@ class Kernel:
             if name in poses.covariates:
                 table[:, k] = poses.covariates[name]
             elif not (name.startswith("approach") and name[8:].isdigit()):
-                raise InvalidInput(f"a term of robot '{self.model.name}' needs the column '{name}', the poses have none")
+                raise InvalidInput(f"a term of robot '{self.model.name}' needs column '{name}', the poses have none")
         return table
 
     def _evaluate(self, kind: str, theta: ArrayLike, poses: PoseInputs) -> list[Array]:
@@ -275,17 +276,18 @@ class Kernel:
         results = [np.empty((n, function.numel_out(k))) for k in range(function.n_out())]
         for k, array in enumerate(arguments):
             if array.size:
-                buffer.set_arg(k, memoryview(array))
+                buffer.set_arg(k, memoryview(array))  # type: ignore[arg-type]
         for k, array in enumerate(results):
-            buffer.set_res(k, memoryview(array))
+            buffer.set_res(k, memoryview(array))  # type: ignore[arg-type]
         run()
         return results
 
     def __getstate__(self) -> dict[str, Any]:
-        return {"model": self.model, "statics": self.statics}
+        return {"model": self.model, "statics": self.statics, "references": (self.world_T_base, self.flange_T_tool)}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__init__(state["model"], state["statics"])  # type: ignore[misc]
+        self.world_T_base, self.flange_T_tool = state["references"]
 
 
 def _matrices(flat: Array) -> Array:

@@ -1,8 +1,8 @@
 """The CasADi graph of a robot for one pose: tool frame, moments, and exact right-twist Jacobians.
 
-Every frame (base, chain, tool) has six coordinates ``c = nominal + deviation + sign q + elasticity * moment + terms``.
-A change of a coordinate moves the tool by a geometric twist column G; what a parameter does to the coordinates, directly
-and by way of the moments, is D + S dm. So ``J = G D + (G S) dm/dtheta``: only D and S (small and sparse) come from
+Each frame (base, chain, tool) has six coordinates ``c = nominal + deviation + sign q + elasticity * moment + terms``.
+A change of a coordinate moves the tool by a geometric twist column G; what a parameter does to the coordinates is
+D directly and S dm by way of the moments. So ``J = G D + (G S) dm/dtheta``: only D and S (small and sparse) come from
 automatic differentiation, G and the moments' derivatives from mechanics. That keeps the graph ten times smaller than
 differentiating the chain.
 
@@ -101,7 +101,9 @@ def pose_graph(model: RobotModel, statics: str = "one_step", derivatives: bool =
     S = ca.jacobian(coordinates, m)
     D, S, D_rest = (ca.substitute(D, m, moment), ca.substitute(S, m, moment),
                     ca.substitute(D, m, ca.SX.zeros(m.shape))) if coupled else (D, S, D)
-    base_lines = _base_lines(at_rest[:6] if statics == "one_step" else deflected[:6])
+    base_six = (at_rest if statics == "one_step" else deflected)[:6]  # those for which the moments were taken
+    base_lines = _base_lines(base_six)
+    base_R = ca.mtimes(W0[:, :3], local_frame(base_six).R) if world_gravity else ca.SX.eye(3)
 
     def feedback(W: ca.SX) -> tuple[ca.SX, ca.SX]:
         """K: derivative of W m by all coordinates; L: by the unknowns at fixed coordinates."""
@@ -113,7 +115,6 @@ def pose_graph(model: RobotModel, statics: str = "one_step", derivatives: bool =
             )
         K = ca.horzcat(K_base, sweep.by_coordinate, ca.SX(6, 6))
         L = ca.SX(6, unknowns.numel())
-        base_R = ca.mtimes(W0[:, :3], local_frame(at_rest[:6]).R) if world_gravity else ca.SX.eye(3)
         for k, dg in tilt_columns.items():
             L[:, k] = ca.mtimes(sweep.by_gravity, ca.mtimes(base_R.T, dg))
         for k, (d_mass, d_moment) in load_columns.items():

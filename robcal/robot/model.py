@@ -174,7 +174,8 @@ class RobotModel:
         for f in self.frames:
             if f.name == name:
                 return f
-        raise InvalidInput(f"robot '{self.name}' has no frame '{name}'; it has {', '.join(f.name for f in self.frames)}")
+        known = ", ".join(f.name for f in self.frames)
+        raise InvalidInput(f"robot '{self.name}' has no frame '{name}'; it has {known}")
 
     def with_parameters(self, values: Mapping[str, float]) -> RobotModel:
         """Copy with the named values set, those of terms included; a value of zero removes a deviation."""

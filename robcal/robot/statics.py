@@ -13,6 +13,7 @@ over all moments be differentiated in one sweep (:func:`moment_sweep`).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import casadi as ca
 
@@ -34,14 +35,21 @@ class LocalFrame:
 
 def local_frame(six: ca.SX) -> LocalFrame:
     """Frame of six numbers x, y, z, roll, pitch, yaw: ``R = Rz(yaw) Ry(pitch) Rx(roll)``."""
-    t = six[:3]
-    cr, cp, cy = ca.cos(six[3]), ca.cos(six[4]), ca.cos(six[5])
-    sr, sp, sy = ca.sin(six[3]), ca.sin(six[4]), ca.sin(six[5])
-    R = ca.SX(3, 3)
-    R[0, 0], R[0, 1], R[0, 2] = cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr
-    R[1, 0], R[1, 1], R[1, 2] = sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr
-    R[2, 0], R[2, 1], R[2, 2] = -sp, cp * sr, cp * cr
-    return LocalFrame(t, R, ca.vertcat(-sy, cy, 0))
+    R, line = _rotation()(six[3:])
+    return LocalFrame(six[:3], R, line)
+
+
+@lru_cache(maxsize=1)
+def _rotation() -> ca.Function:
+    """Rotation and pitch line of (roll, pitch, yaw); a function once built is inlined faster than written again."""
+    rpy = ca.SX.sym("rpy", 3)
+    (cr, cp, cy), (sr, sp, sy) = ([f(rpy[k]) for k in range(3)] for f in (ca.cos, ca.sin))
+    R = ca.vertcat(
+        ca.horzcat(cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),
+        ca.horzcat(sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr),
+        ca.horzcat(-sp, cp * sr, cp * cr),
+    )
+    return ca.Function("rotation", [rpy], [R, ca.vertcat(-sy, cy, 0)])
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ accepted: numbers, names, ``+ - * / **`` (exponent a plain number up to 16), com
 Names are the term's own parameters (short names) or variables:
 
 - ``q1..qN`` (sense of q, rad or m), ``approach1..N`` (-1, 0, +1; 0 where not recorded),
-- ``torque1..N``: static moment of the weights about the joint's own line in the sense of q (N m; force in N if sliding),
+- ``torque1..N``: static moment of the weights about the joint's own line in the sense of q (N m; N if sliding),
 - ``<frame>_mroll``, ``_mpitch``, ``_myaw``: moment about the line about which that angle turns (N m),
 - ``base_mx``, ``base_my``, ``base_mz``: moment about the base origin in base coordinates (N m),
 - ``payload_mass`` (kg), ``index`` (row number), and any numeric covariate column by its name.
@@ -38,9 +38,8 @@ MAX_LENGTH = 4000
 MAX_NODES = 1000
 MAX_EXPONENT = 16.0
 
-_ARGUMENTS = {name: 1 for name in (
-    "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "exp", "log", "sqrt", "abs", "sign", "step",
-)} | {"atan2": 2, "minimum": 2, "maximum": 2, "where": 3}
+_UNARY = "sin cos tan asin acos atan sinh cosh tanh exp log sqrt abs sign step"
+_ARGUMENTS = dict.fromkeys(_UNARY.split(), 1) | {"atan2": 2, "minimum": 2, "maximum": 2, "where": 3}
 
 # Numbers become numpy's or CasADi's at once: Python's own would turn (-8) ** 0.5 complex and raise on 1 / 0.
 _NUMPY: dict[str, Callable[..., Any]] = {
@@ -157,11 +156,11 @@ def _check(node: ast.AST, expression: str) -> None:
             finite = False
         if not finite:
             raise InvalidInput(f"'{expression[:120]}': a number is too large")
-        return
+        return None
     if isinstance(node, ast.Name):
         if node.id.startswith("__"):
             raise InvalidInput(f"'{expression[:120]}': the name '{node.id}' is not allowed")
-        return
+        return None
     if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.UAdd | ast.USub):
         return _check(node.operand, expression)
     if isinstance(node, ast.BinOp) and type(node.op) in _BINARY:
