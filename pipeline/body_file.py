@@ -72,9 +72,9 @@ def read_body(path: Path | str) -> BodyFile:
     InvalidInput : contradicts the contract: duplicate ids, two targets in one place, an impossible ring12 id.
     """
     entry, document = read_entry(Path(path), BodyEntry, FORMAT)
-    rows: list[BodyTargetRow] = Field(default_factory=list)
-    first: dict[int, int] = Field(default_factory=dict)
-    places: dict[tuple[float, float, float], int] = Field(default_factory=dict)
+    rows: list[BodyTargetRow] = []
+    first: dict[int, int] = {}
+    places: dict[tuple[float, float, float], int] = {}
     for i, target in enumerate(entry.targets):
         line = document.line(("targets", i))
         where = f"{document.path}, line {line}"

@@ -1,0 +1,290 @@
+"""A campaign: what was recorded and what is what, read and checked before any stage runs. Never written to."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.body_file import BodyFile, read_body
+from pipeline.camera_file import CameraFile, read_camera
+from pipeline.campaign_schema import FORMAT, CampaignEntry, StationCameraEntry, SurveyEntry
+from pipeline.images import list_images
+from pipeline.measurement_tables import MarksTable, MeasuredTable, read_marks, read_measurements
+from pipeline.poses_table import Poses, read_poses
+from pipeline.robot_file import read_robot
+from pipeline.schemas import parse, proposal
+from pipeline.yaml_io import YamlDocument, read_yaml
+from robcal.errors import InvalidInput
+from robcal.robot.model import RobotModel
+
+
+@dataclass(frozen=True)
+class ImageSource:
+    """Where the marks of a camera or a survey come from: image files or a table of marks.
+
+    Attributes
+    ----------
+    images : name -> file (the name is the file name; for a station camera the pose id); empty if marks are given.
+    start : camera file with start values, None if there is none.
+    """
+
+    images: Mapping[str, Path]
+    marks: MarksTable | None
+    start: CameraFile | None
+    start_path: Path | None = None
+    size: tuple[int, int] | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Image names in order."""
+        return tuple(self.images) if self.marks is None else tuple(dict.fromkeys(self.marks.image))
+
+
+@dataclass(frozen=True)
+class BodySource:
+    """A body of the campaign and its survey, if there is one."""
+
+    file: BodyFile
+    survey: ImageSource | None = None
+    survey_entry: SurveyEntry | None = None
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """Everything a run needs to know, in SI units."""
+
+    path: Path
+    entry: CampaignEntry
+    document: YamlDocument = field(repr=False)
+    robot: RobotModel | None
+    poses: Poses | None
+    bodies: Mapping[str, BodySource]
+    cameras: Mapping[str, ImageSource]
+    measurements: tuple[MeasuredTable, ...]
+    notes: tuple[str, ...] = ()
+    files: tuple[Path, ...] = field(default=(), repr=False)
+
+    @property
+    def name(self) -> str:
+        """Name of the campaign."""
+        return self.entry.name
+
+    @property
+    def carried_body(self) -> str | None:
+        """Name of the body that the robot carries (or that the sensor looks at), None if there is none."""
+        if self.entry.station is not None:
+            return self.entry.station.body
+        if self.entry.body is not None:
+            return self.entry.body
+        return next(iter(self.bodies)) if len(self.bodies) == 1 else None
+
+    @property
+    def has_images(self) -> bool:
+        """Whether any image file has to be searched for targets."""
+        surveys = [b.survey for b in self.bodies.values() if b.survey is not None]
+        return any(source.images for source in [*surveys, *self.cameras.values()])
+
+    def measured(self, kind: str) -> tuple[MeasuredTable, ...]:
+        """Tables of one kind."""
+        return tuple(table for table in self.measurements if table.kind == kind)
+
+
+def campaign_file(path: Path) -> Path:
+    """The campaign.yaml meant by a folder or a file.
+
+    Raises
+    ------
+    InvalidInput : there is none.
+    """
+    if path.is_dir():
+        file = path / "campaign.yaml"
+        if not file.is_file():
+            names = sorted(p.name for p in path.glob("*.y*ml"))
+            hint = f" (it has {', '.join(names[:3])}: name the file itself)" if names else " (the folder needs one)"
+            raise InvalidInput(f"{path}: no campaign.yaml in this folder{hint}: it says what the recordings are")
+        return file
+    if not path.exists():
+        raise InvalidInput(f"{path}: no such folder or file: name the campaign folder")
+    return path
+
+
+def read_campaign(path: Path | str) -> Campaign:
+    """Read and check a campaign.
+
+    Raises
+    ------
+    InvalidInput : the first contradiction found, with file, row and remedy.
+    """
+    return _Reader(campaign_file(Path(path))).read()
+
+
+class _Reader:
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.document = read_yaml(path)
+        self.entry = parse(self.document, CampaignEntry, FORMAT)
+        self.notes: list[str] = []
+        self.files: list[Path] = [path]
+
+    def read(self) -> Campaign:
+        entry = self.entry
+        self._check_whole()
+        robot = self._robot()
+        bodies = {name: self._body(name) for name in entry.bodies}
+        poses = None
+        if entry.poses is not None:
+            poses = read_poses(self._file(entry.poses), robot, robot.payloads if robot else ())
+            self.notes.extend(poses.notes)
+        cameras = self._station(poses)
+        if poses is None and entry.station is not None:
+            poses = self._poses_from_images(cameras)
+        measurements = tuple(
+            read_measurements(self._file(name), poses.names if poses else ()) for name in entry.measurements
+        )
+        for table in measurements:
+            self.notes.extend(table.notes)
+            self._check_targets(table, bodies)
+        return Campaign(
+            path=self.path,
+            entry=entry,
+            document=self.document,
+            robot=robot,
+            poses=poses,
+            bodies=bodies,
+            cameras=cameras,
+            measurements=measurements,
+            notes=tuple(self.notes),
+            files=tuple(dict.fromkeys(self.files)),
+        )
+
+    def _error(self, place: tuple[str | int, ...], message: str) -> InvalidInput:
+        line = self.document.line(place)
+        return InvalidInput(f"{self.path}{f', line {line}' if line else ''}: {message}")
+
+    def _file(self, name: str) -> Path:
+        path = self.path.parent / name
+        self.files.append(path)
+        return path
+
+    def _check_whole(self) -> None:
+        entry = self.entry
+        surveyed = any(body.survey for body in entry.bodies.values())
+        measured = bool(entry.measurements)
+        if entry.station is not None and measured:
+            raise self._error(("measurements",), "'measurements' stand instead of 'station': keep one of them")
+        if measured and entry.poses is None:
+            raise self._error(("measurements",), "measurements need the table of their poses: add 'poses: poses.csv'")
+        if measured and entry.robot is None and not entry.bodies:
+            raise self._error(("measurements",), "measurements need a robot or a body: add 'robot: robot.yaml'")
+        if entry.robot is not None and entry.poses is None and (measured or entry.station is not None):
+            raise self._error(("robot",), "a robot needs its joint angles: add 'poses: poses.csv'")
+        if not (surveyed or measured or entry.station is not None):
+            raise self._error((), "nothing to work on: give a body a 'survey', or add a 'station' or 'measurements'")
+        carried = entry.station.body if entry.station else None
+        for key, place in ((entry.body, ("body",)), (carried, ("station", "body"))):
+            if key is not None and key not in entry.bodies:
+                raise self._error(place, f"there is no body '{key}' under 'bodies'{proposal(key, list(entry.bodies))}")
+
+    def _robot(self) -> RobotModel | None:
+        if self.entry.robot is None:
+            return None
+        robot = read_robot(self._file(self.entry.robot))
+        loads = {name: load.payload() for name, load in self.entry.payloads.items()}
+        return replace(robot, payloads={**robot.payloads, **loads})
+
+    def _body(self, name: str) -> BodySource:
+        use = self.entry.bodies[name]
+        file = read_body(self._file(use.targets))
+        if use.survey is None:
+            return BodySource(file)
+        place = ("bodies", name, "survey")
+        source = self._source(use.survey, use.survey.camera, place, f"the survey of '{name}'")
+        return BodySource(file, source, use.survey)
+
+    def _source(
+        self, entry: SurveyEntry | StationCameraEntry, camera: str | None, place: tuple[str | int, ...], what: str
+    ) -> ImageSource:
+        if (entry.images is None) == (entry.observations is None):
+            raise self._error(place, f"{what} needs either 'images' (a folder) or 'observations' (a CSV file)")
+        start = read_camera(self._file(camera)) if camera is not None else None
+        start_path = self.path.parent / camera if camera is not None else None
+        size = entry.size_px
+        if start is not None:
+            size = (start.camera.width, start.camera.height)
+        if entry.observations is not None:
+            return ImageSource({}, read_marks(self._file(entry.observations)), start, start_path, size)
+        folder = self.path.parent / str(entry.images)
+        return ImageSource(list_images(folder, what), None, start, start_path, size)
+
+    def _station(self, poses: Poses | None) -> dict[str, ImageSource]:
+        station = self.entry.station
+        if station is None:
+            return {}
+        if not station.cameras:
+            raise self._error(("station", "cameras"), "the station has no cameras: name at least one")
+        cameras = {}
+        for name, use in station.cameras.items():
+            source = self._source(use, use.calibration, ("station", "cameras", name), f"camera '{name}'")
+            if use.images is not None:
+                source = replace(source, images=self._by_stem(source.images, name))
+            cameras[name] = self._match_poses(source, name, poses)
+        return cameras
+
+    def _by_stem(self, images: Mapping[str, Path], camera: str) -> dict[str, Path]:
+        stems: dict[str, Path] = {}
+        for path in images.values():
+            if path.stem in stems:
+                raise InvalidInput(
+                    f"{path}: pose '{path.stem}' has two images ({stems[path.stem].name} and {path.name}): remove one"
+                )
+            stems[path.stem] = path
+        return stems
+
+    def _match_poses(self, source: ImageSource, camera: str, poses: Poses | None) -> ImageSource:
+        if poses is None:
+            return source
+        known = set(poses.names)
+        if source.marks is not None:
+            for i, image in enumerate(source.marks.image):
+                if image not in known:
+                    raise InvalidInput(
+                        f"{source.marks.path}: image '{image}' is not a pose of {poses.path.name} (mark {i + 1}): for "
+                        "a station camera the image is the pose id"
+                    )
+        strangers = [name for name in source.images if name not in known]
+        if source.images and len(strangers) == len(source.images):
+            path = source.images[strangers[0]]
+            raise InvalidInput(
+                f"{path}: no image of camera '{camera}' has the name of a pose in {poses.path.name} (first pose "
+                f"'{poses.names[0]}'): the file stem must be the pose id"
+            )
+        for name in strangers:
+            self.notes.append(f"{source.images[name]}: no pose '{name}' in {poses.path.name}: the image is not used")
+        have = set(source.names)
+        missing = [name for name in poses.names if name not in have]
+        for name in missing[:5]:
+            self.notes.append(f"{poses.path}: pose '{name}' has no image of camera '{camera}'")
+        if len(missing) > 5:
+            self.notes.append(f"{poses.path}: {len(missing) - 5} more poses have no image of camera '{camera}'")
+        return replace(source, images={name: p for name, p in source.images.items() if name in known})
+
+    def _poses_from_images(self, cameras: Mapping[str, ImageSource]) -> Poses:
+        names = tuple(sorted({name for source in cameras.values() for name in source.names}))
+        n = len(names)
+        rows = np.zeros(n, dtype=np.int64)
+        return Poses(self.path, names, rows, np.zeros((n, 0)), (None,) * n, np.zeros(n, bool), np.zeros((n, 0)))
+
+    def _check_targets(self, table: MeasuredTable, bodies: Mapping[str, BodySource]) -> None:
+        if table.kind not in ("points", "sensor_points") or not bodies:
+            return
+        listed = {t.id for body in bodies.values() for t in body.file.targets if t.id is not None}
+        surveyed = any(body.survey is not None for body in bodies.values())
+        for i, target in enumerate(table.target):
+            if int(target) not in listed and not surveyed:
+                raise InvalidInput(
+                    f"{table.path}, row {int(table.rows[i])}: target {int(target)} is in no body of the campaign"
+                    f"{proposal(str(int(target)), [str(t) for t in sorted(listed)])}: add it there or remove the row"
+                )

@@ -1,0 +1,133 @@
+"""campaign.yaml (format robcal/campaign-1): the entries as a person writes them."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator, Field
+
+from pipeline.robot_file import PayloadEntry
+from pipeline.schemas import Entry, NotNegative, Positive, Text, Whole
+
+FORMAT = "robcal/campaign-1"
+
+
+def _folder_name(value: Any) -> Any:
+    text = str(value)
+    if not text.strip() or text in {".", ".."} or any(c in text for c in "/\\\0") or len(text) > 120:
+        raise ValueError(f"must be a plain name without slashes (it names the run folder), found {text[:60]!r}")
+    return text
+
+
+def _pair(value: Any) -> Any:
+    if isinstance(value, list) and len(value) == 2 and value[0] == value[1]:
+        raise ValueError(f"names target {value[0]} twice: a length goes from one target to another")
+    return value
+
+
+def _one_or_many(value: Any) -> Any:
+    return value if isinstance(value, list) else [value]
+
+
+class ScaleBarEntry(Entry):
+    """A known distance between two targets."""
+
+    targets: Annotated[tuple[Whole, Whole], BeforeValidator(_pair)]
+    length_mm: Positive
+    sigma_mm: Positive
+
+
+class CheckLengthEntry(Entry):
+    """A distance that is only compared."""
+
+    targets: Annotated[tuple[Whole, Whole], BeforeValidator(_pair)]
+    length_mm: Positive
+    sigma_mm: NotNegative | None = None
+
+
+class FixedDatum(Entry):
+    """Targets whose coordinates fix the datum."""
+
+    fixed: list[Whole]
+
+
+class SurveyEntry(Entry):
+    """A free-hand image set of a body, or marks measured by another program."""
+
+    images: Text | None = None
+    observations: Text | None = None
+    camera: Text | None = None
+    size_px: tuple[Whole, Whole] | None = None
+    scale_bars: list[ScaleBarEntry] = Field(default_factory=list)
+    check_lengths: list[CheckLengthEntry] = Field(default_factory=list)
+    datum: Literal["free", "bars"] | FixedDatum = "free"
+
+
+class BodyUse(Entry):
+    """A body of the campaign."""
+
+    targets: Text
+    survey: SurveyEntry | None = None
+
+
+class StationCameraEntry(Entry):
+    """A camera that watches the robot."""
+
+    images: Text | None = None
+    observations: Text | None = None
+    calibration: Text | None = None
+    size_px: tuple[Whole, Whole] | None = None
+
+
+class StationEntry(Entry):
+    """The cameras that watch the robot and the body that it carries."""
+
+    cameras: dict[str, StationCameraEntry]
+    body: Text
+
+
+class QualityEntry(Entry):
+    """Limits."""
+
+    distance_tolerance_mm: Positive | None = None
+
+
+class ModelEntry(Entry):
+    """Choices of the identification."""
+
+    parameters: Literal["standard", "geometry", "table5.4"] | list[Text] = "standard"
+    objective: Literal["maximum_likelihood", "basis_norm"] = "maximum_likelihood"
+    robust: bool = False
+    statics: Literal["one_step", "converged"] = "one_step"
+    joint_sigma_deg: NotNegative | None = None
+
+
+class BundleEntry(Entry):
+    """Choices of the bundle adjustment."""
+
+    engine: Literal["robcal", "pycolmap"] = "robcal"
+
+
+class DiagnosisEntry(Entry):
+    """Choices of the diagnosis."""
+
+    enabled: bool = True
+    level: Annotated[float, Field(gt=0, lt=0.5)] = 0.01
+
+
+class CampaignEntry(Entry):
+    """The whole file."""
+
+    format: Literal["robcal/campaign-1"]
+    name: Annotated[str, BeforeValidator(_folder_name)]
+    robot: Text | None = None
+    poses: Text | None = None
+    payloads: dict[str, PayloadEntry] = Field(default_factory=dict)
+    bodies: dict[str, BodyUse] = Field(default_factory=dict)
+    station: StationEntry | None = None
+    quality: QualityEntry = QualityEntry()
+    measurements: Annotated[list[Text], BeforeValidator(_one_or_many)] = Field(default_factory=list)
+    body: Text | None = None
+    model: ModelEntry = ModelEntry()
+    bundle: BundleEntry = BundleEntry()
+    diagnosis: DiagnosisEntry = DiagnosisEntry()

@@ -1,0 +1,119 @@
+"""Image files: listing a folder, reading grey values of 8 or 16 bit, telling broken files."""
+
+from __future__ import annotations
+
+import os
+import re
+import struct
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.files import read_bytes
+from robcal.errors import InvalidInput
+
+SUFFIXES = frozenset({".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp"})
+MAX_BYTES = 1_500_000_000
+MAX_PIXELS = 400_000_000
+
+GreyImage = NDArray[np.uint8 | np.uint16]
+
+
+def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
+    """Sort key by which p9 comes before p10."""
+    parts = re.split(r"(\d+)", name)
+    return tuple((0, int(part), "") if part.isdigit() and len(part) < 19 else (1, 0, part) for part in parts)
+
+
+def list_images(folder: Path, what: str) -> dict[str, Path]:
+    """File name -> path of the images of a folder, in natural order; hidden files are skipped.
+
+    Raises
+    ------
+    InvalidInput : the folder is missing or has no images.
+    """
+    if not folder.exists():
+        raise InvalidInput(f"{folder}: no such folder, {what} needs its images there: check the name in campaign.yaml")
+    if not folder.is_dir():
+        raise InvalidInput(f"{folder}: is not a folder, {what} needs a folder of images")
+    try:
+        found = [p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and not p.name.startswith(".")]
+    except OSError as error:
+        raise InvalidInput(f"{folder}: cannot be read: {error.strerror or error}") from None
+    if not found:
+        raise InvalidInput(f"{folder}: no images in this folder, {what} needs some (PNG, TIFF, JPEG or BMP)")
+    return {p.name: p for p in sorted(found, key=lambda p: natural_key(p.name))}
+
+
+def read_image(path: Path) -> GreyImage:
+    """Grey values (h, w) of an image file, 8 or 16 bit; colour is converted.
+
+    Raises
+    ------
+    InvalidInput : not an image, truncated, or of an unusual kind; the message says which file and what to do.
+    """
+    raw = read_bytes(path, MAX_BYTES)
+    _check_complete(path, raw)
+    try:
+        with _silent_decoders():
+            image = cv2.imdecode(np.frombuffer(raw, np.uint8), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
+    except cv2.error:
+        image = None
+    if image is None or image.size == 0:
+        raise InvalidInput(f"{path}: corrupt image, it cannot be decoded: copy it again or remove it")
+    if image.dtype not in (np.uint8, np.uint16):
+        raise InvalidInput(f"{path}: grey values of type {image.dtype}: save the image with 8 or 16 bit")
+    if image.ndim == 3:
+        channels = image.shape[2]
+        image = image[:, :, 0] if channels in (1, 2) else cv2.cvtColor(image[:, :, :3], cv2.COLOR_BGR2GRAY)
+    return np.ascontiguousarray(image, dtype=image.dtype)
+
+
+def _check_complete(path: Path, raw: bytes) -> None:
+    """Decoders fill up what is missing with grey without a word, so the file's own end marks are checked first."""
+    truncated = False
+    width = height = 0
+    if not raw:
+        raise InvalidInput(f"{path}: empty image file: copy it again or remove it")
+    if raw.startswith(b"\x89PNG\r\n\x1a\n"):
+        truncated = b"IEND" not in raw[-4096:] and b"IEND" not in raw
+        if len(raw) >= 24:
+            width, height = struct.unpack(">II", raw[16:24])
+    elif raw.startswith(b"\xff\xd8"):
+        # the last start of scan belongs to the main image; its end mark must follow it
+        truncated = raw.rfind(b"\xff\xd9") < raw.rfind(b"\xff\xda")
+    elif raw.startswith(b"BM") and len(raw) >= 30:
+        offset, _, width, height = struct.unpack("<IIii", raw[10:26])
+        bits = struct.unpack("<H", raw[28:30])[0]
+        compressed = len(raw) >= 34 and struct.unpack("<I", raw[30:34])[0] not in (0, 3)
+        truncated = not compressed and len(raw) < offset + (abs(width) * bits + 31) // 32 * 4 * abs(height)
+    elif not raw.startswith((b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")):
+        raise InvalidInput(f"{path}: is not a PNG, TIFF, JPEG or BMP image in spite of its name: convert or remove it")
+    if abs(width) * abs(height) > MAX_PIXELS:
+        raise InvalidInput(f"{path}: {abs(width)} x {abs(height)} pixels are more than {MAX_PIXELS}: crop the image")
+    if truncated:
+        raise InvalidInput(f"{path}: truncated image, its end is missing: copy it again or remove it")
+
+
+@contextmanager
+def _silent_decoders() -> Iterator[None]:
+    """Keep the C decoders' own warnings (libpng, libtiff) off the terminal; what matters is raised as an error."""
+    try:
+        stderr = sys.__stderr__.fileno() if sys.__stderr__ is not None else 2
+        saved = os.dup(stderr)
+    except (OSError, ValueError):
+        yield
+        return
+    sink = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(sink, stderr)
+        yield
+    finally:
+        os.dup2(saved, stderr)
+        os.close(saved)
+        os.close(sink)

@@ -1,0 +1,260 @@
+"""Measurements given as tables: points, frames, distances, points in the sensor, marks in images.
+
+The kind of a table is told by its columns. Everything is converted to metres and radians here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.tables import Table, read_table
+from robcal.errors import InvalidInput
+from robcal.transforms import Array, frame_from_xyzrpy
+
+IntArray = NDArray[np.int64]
+Kind = Literal["points", "frames", "distances", "sensor_points"]
+
+SIX = ("x", "y", "z", "roll", "pitch", "yaw")
+MAX_METRES = 10_000.0
+
+
+@dataclass(frozen=True)
+class MeasuredTable:
+    """Measurements of one table.
+
+    Attributes
+    ----------
+    pose : (m,) index into the campaign's poses; rows : row in the file.
+    target : (m,) ids, -1 where the kind has none.
+    values : (m, 3) points in m, (m, 4, 4) frames, or (m,) distances in m.
+    covariance : (m, 3, 3), (m, 6, 6) (right perturbation of the frame) or (m,) variances; None if not stated.
+    covariates : further numeric columns that belong to the single measurement (``cycle``, ``time_s``).
+    """
+
+    kind: Kind
+    path: Path
+    pose: IntArray
+    rows: IntArray
+    target: IntArray
+    values: Array
+    covariance: Array | None
+    covariates: Mapping[str, Array]
+    notes: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.pose)
+
+
+@dataclass(frozen=True)
+class MarksTable:
+    """Marks measured by another program: image names, target ids, pixels and their standard deviation."""
+
+    path: Path
+    image: tuple[str, ...]
+    target: IntArray
+    xy: Array
+    sigma: Array
+    stated: bool
+
+    def __len__(self) -> int:
+        return len(self.image)
+
+
+def read_measurements(path: Path, pose_names: Sequence[str], kind: Kind | None = None) -> MeasuredTable:
+    """Read a table of measurements; ``kind`` overrules what the columns tell.
+
+    Raises
+    ------
+    InvalidInput : not one of the kinds, unknown pose, doubled measurement, impossible numbers.
+    """
+    table = read_table(path)
+    kind = kind or _kind(table)
+    needed = {
+        "points": ["pose", "target", "x_mm", "y_mm", "z_mm"],
+        "sensor_points": ["pose", "target", "x_mm", "y_mm", "z_mm"],
+        "frames": ["pose", "x_mm", "y_mm", "z_mm", "roll_deg", "pitch_deg", "yaw_deg"],
+        "distances": ["pose", "distance_mm"],
+    }[kind]
+    table.require(needed)
+    if not len(table):
+        raise InvalidInput(f"{path}: lists no measurements")
+    pose, notes = _pose_index(table, pose_names)
+    target = _target_ids(table) if "target" in needed else np.full(len(table), -1, dtype=np.int64)
+    keys = ["pose", *(["target"] if "target" in needed else []), *(["cycle"] if table.has("cycle") else [])]
+    table.unique(keys)
+    if kind == "distances":
+        values = table.numbers("distance_mm", positive=True) / 1000
+        covariance = (table.numbers("sigma_mm", positive=True) / 1000) ** 2 if table.has("sigma_mm") else None
+    elif kind == "frames":
+        offsets = [table.numbers(f"{n}_mm") / 1000 for n in SIX[:3]]
+        six = np.column_stack([*offsets, *(np.radians(table.numbers(f"{n}_deg")) for n in SIX[3:])])
+        values = frame_from_xyzrpy(six)
+        covariance = _frame_covariance(table, six)
+    else:
+        values = np.column_stack([table.numbers(f"{n}_mm") for n in SIX[:3]]) / 1000
+        covariance = _point_covariance(table)
+    _check_size(table, values)
+    covariates = {name: table.numbers(name) for name in ("cycle", "time_s") if table.has(name)}
+    return MeasuredTable(kind, path, pose, table.rows, target, values, covariance, covariates, tuple(notes))
+
+
+def _kind(table: Table) -> Kind:
+    if table.has("distance_mm"):
+        return "distances"
+    if table.has("roll_deg") or table.has("pitch_deg") or table.has("yaw_deg"):
+        return "frames"
+    if table.has("target"):
+        return "sensor_points" if table.has("cycle") or "sensor" in table.path.stem.lower() else "points"
+    table.require(["pose"])
+    raise InvalidInput(
+        f"{table.path}, row 1: the columns are of no known kind: points need pose, target, x_mm, y_mm, z_mm; frames "
+        "pose, x_mm, y_mm, z_mm, roll_deg, pitch_deg, yaw_deg; distances pose, distance_mm"
+    )
+
+
+def _pose_index(table: Table, pose_names: Sequence[str]) -> tuple[IntArray, list[str]]:
+    place = {name: i for i, name in enumerate(pose_names)}
+    cells = table.texts("pose")
+    unknown = [i for i, cell in enumerate(cells) if cell not in place]
+    if unknown:
+        raise table.error(
+            unknown[0],
+            f"pose '{cells[unknown[0]]}' is not in the table of poses ({len(unknown)} such rows): add it there or "
+            "remove the row",
+        )
+    measured = set(cells)
+    missing = [name for name in pose_names if name not in measured]
+    notes = []
+    if missing:
+        notes.append(f"{len(missing)} poses have no measurement in {table.path.name} ({_few(missing)})")
+    return np.array([place[cell] for cell in cells], dtype=np.int64), notes
+
+
+def _few(names: Sequence[str]) -> str:
+    return ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
+
+
+def _target_ids(table: Table) -> IntArray:
+    for i, cell in enumerate(table.columns["target"]):
+        if not cell.lstrip("-").isdigit():
+            raise table.error(i, f"target '{cell[:40]}' is not a whole number: targets are named by their integer ids")
+    return table.whole_numbers("target")
+
+
+def _point_covariance(table: Table) -> Array | None:
+    full = ("sxx_mm2", "sxy_mm2", "sxz_mm2", "syy_mm2", "syz_mm2", "szz_mm2")
+    some = [name for name in full if table.has(name)]
+    if some and len(some) < len(full):
+        table.require(full)
+    if some:
+        six = np.column_stack([table.numbers(name) for name in full]) * 1e-6
+        covariance = six[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+        return _positive_definite(table, covariance)
+    if table.has("sigma_mm"):
+        sigma = table.numbers("sigma_mm", positive=True) / 1000
+        return sigma[:, None, None] ** 2 * np.eye(3)
+    names = ("sx_mm", "sy_mm", "sz_mm")
+    if table.has(*names):
+        sigmas = np.column_stack([table.numbers(name, positive=True) for name in names]) / 1000
+        return sigmas[:, :, None] ** 2 * np.eye(3)
+    return None
+
+
+def _positive_definite(table: Table, covariance: Array) -> Array:
+    lowest = np.linalg.eigvalsh(covariance)[:, 0]
+    bad = lowest <= 0
+    if bad.any():
+        remedy = "its variances must outweigh its covariances, check the columns"
+        raise table.error(int(np.argmax(bad)), f"the covariance is not positive definite: {remedy}")
+    return covariance
+
+
+def frame_covariance_columns() -> list[tuple[str, int, int]]:
+    """Column names of a full 6x6 covariance of x, y, z, roll, pitch, yaw and the places of its elements."""
+    columns = []
+    for i, first in enumerate(SIX):
+        for j in range(i, 6):
+            unit = "mm2" if j < 3 else "deg2" if i >= 3 else "mm_deg"
+            columns.append((f"s{first}{SIX[j]}_{unit}", i, j))
+    return columns
+
+
+def twist_from_six(six: Array) -> Array:
+    """(n, 6, 6) Jacobian of the right perturbation (rho, omega) of a frame by its numbers x, y, z, roll, pitch, yaw.
+
+    With R = Rz(yaw) Ry(pitch) Rx(roll): rho = R' dt, and the body's turn is the sum of the rates about the line that
+    each angle turns about: omega = droll ex + Rx' dpitch ey + Rx' Ry' dyaw ez.
+    """
+    zero = np.zeros_like(six)
+    roll, pitch = zero.copy(), zero.copy()
+    roll[:, 3], pitch[:, 4] = six[:, 3], six[:, 4]
+    Rx = frame_from_xyzrpy(roll)[:, :3, :3]
+    Ry = frame_from_xyzrpy(pitch)[:, :3, :3]
+    R = frame_from_xyzrpy(six)[:, :3, :3]
+    jacobian = np.zeros((len(six), 6, 6))
+    jacobian[:, :3, :3] = np.swapaxes(R, 1, 2)
+    jacobian[:, 3, 3] = 1.0
+    jacobian[:, 3:, 4] = np.swapaxes(Rx, 1, 2)[:, :, 1]
+    jacobian[:, 3:, 5] = (np.swapaxes(Rx, 1, 2) @ np.swapaxes(Ry, 1, 2))[:, :, 2]
+    return jacobian
+
+
+def _frame_covariance(table: Table, six: Array) -> Array | None:
+    scale = np.array([1e-3] * 3 + [np.pi / 180] * 3)
+    numbers = np.zeros((len(six), 6, 6))
+    columns = frame_covariance_columns()
+    if any(table.has(name) for name, _, _ in columns):
+        table.require([name for name, _, _ in columns])
+        for name, i, j in columns:
+            numbers[:, i, j] = numbers[:, j, i] = table.numbers(name)
+    elif table.has(*(f"s{n}_mm" for n in SIX[:3]), *(f"s{n}_deg" for n in SIX[3:])):
+        for k, n in enumerate(SIX):
+            numbers[:, k, k] = table.numbers(f"s{n}_{'mm' if k < 3 else 'deg'}", positive=True) ** 2
+    elif table.has("sigma_mm", "sigma_deg"):
+        # an isotropic covariance of position and of rotation needs no transport
+        sigma = table.numbers("sigma_mm", positive=True) / 1000
+        turn = np.radians(table.numbers("sigma_deg", positive=True))
+        diagonal = np.concatenate([np.tile(sigma[:, None], 3), np.tile(turn[:, None], 3)], axis=1) ** 2
+        return diagonal[:, :, None] * np.eye(6)
+    elif table.has("sigma_mm") or table.has("sigma_deg"):
+        table.require(["sigma_mm", "sigma_deg"])
+    else:
+        return None
+    jacobian = twist_from_six(six) * scale
+    return _positive_definite(table, jacobian @ numbers @ np.swapaxes(jacobian, 1, 2))
+
+
+def _check_size(table: Table, values: Array) -> None:
+    lengths = np.abs(values[:, :3, 3] if values.ndim == 3 else values.reshape(len(values), -1)).max(axis=1)
+    if (lengths > MAX_METRES).any():
+        i = int(np.argmax(lengths > MAX_METRES))
+        raise table.error(i, f"a length of {lengths[i]:.3g} m: coordinates are in mm, check the unit")
+
+
+def read_marks(path: Path, default_sigma: float = 0.1) -> MarksTable:
+    """Read observations.csv: ``image, target, x_px, y_px`` and optional ``sigma_px`` (default 0.1 px).
+
+    Raises
+    ------
+    InvalidInput : missing columns, NaN, a target twice in one image.
+    """
+    table = read_table(path)
+    table.require(["image", "target", "x_px", "y_px"])
+    if not len(table):
+        raise InvalidInput(f"{path}: lists no marks")
+    image = table.texts("image")
+    target = _target_ids(table)
+    table.unique(["image", "target"])
+    xy = np.column_stack([table.numbers("x_px"), table.numbers("y_px")])
+    if np.abs(xy).max() > 1e6:
+        i = int(np.argmax(np.abs(xy).max(axis=1)))
+        raise table.error(i, "a mark a million pixels off the image: coordinates are in pixels")
+    stated = table.has("sigma_px")
+    sigma = table.numbers("sigma_px", positive=True) if stated else np.full(len(table), default_sigma)
+    return MarksTable(path, image, target, xy, sigma, stated)

@@ -1,0 +1,212 @@
+"""poses.csv: one row per pose in the order in which they were driven."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.schemas import proposal, shown
+from pipeline.tables import Table, read_table
+from robcal.errors import InvalidInput
+from robcal.robot.model import RobotModel
+from robcal.transforms import Array
+
+LIMIT_SLACK = 1e-3
+"""Poses may lie this much (rad or m) beyond a limit: controllers round."""
+RESTING = np.radians(1e-4)
+"""A joint that moved less than this (rad or m) from one pose to the next did not move."""
+NO_PAYLOAD = frozenset({"", "none", "-", "0"})
+
+
+@dataclass(frozen=True)
+class Poses:
+    """The joint log of a campaign.
+
+    Attributes
+    ----------
+    names : (n,) pose ids; rows : row numbers in the file.
+    q : (n, joints) rad or m, as commanded.
+    payload : (n,) name of the load, None without.
+    verify : (n,) true for poses that are kept out of the identification.
+    approach : (n, joints) -1, 0, +1; inferred : true where it was taken from the order of the poses.
+    covariates : further numeric columns by name (``time_s``, ``temp_<place>_c``, any other), as in the file.
+    notes : what was assumed or ignored, in words.
+    """
+
+    path: Path
+    names: tuple[str, ...]
+    rows: NDArray[np.int64] = field(repr=False)
+    q: Array = field(repr=False)
+    payload: tuple[str | None, ...] = field(repr=False)
+    verify: NDArray[np.bool_] = field(repr=False)
+    approach: Array = field(repr=False)
+    approach_inferred: bool = False
+    covariates: Mapping[str, Array] = field(default_factory=dict, repr=False)
+    notes: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+
+def approach_from_order(q: Array) -> Array:
+    """Direction (n, joints) in which each joint last moved when the poses were driven one after the other.
+
+    The first pose of a joint that has not moved yet gets 0. Weakness: the way between two poses is not known, only
+    its ends.
+    """
+    step = np.diff(q, axis=0, prepend=q[:1])
+    direction = np.where(np.abs(step) > RESTING, np.sign(step), 0.0)
+    for i in range(1, len(direction)):
+        still = direction[i] == 0
+        direction[i, still] = direction[i - 1, still]
+    return direction
+
+
+def joint_columns(robot: RobotModel) -> list[tuple[str, float]]:
+    """Column name and factor to SI of each joint."""
+    return [
+        (f"q{k}_mm", 1e-3) if joint.prismatic else (f"q{k}_deg", np.pi / 180)
+        for k, joint in enumerate(robot.joints, start=1)
+    ]
+
+
+def read_poses(
+    path: Path, robot: RobotModel | None, payloads: Collection[str], *, to_predict: bool = False
+) -> Poses:
+    """Read poses.csv; without a robot only the column ``pose`` counts.
+
+    ``to_predict``: the contract's defaults for poses to predict: approach 0 (never inferred), limits not checked.
+
+    Raises
+    ------
+    InvalidInput : the table contradicts the contract or the robot (columns, limits, payloads).
+    """
+    table = read_table(path)
+    table.require(["pose"])
+    if not len(table):
+        raise InvalidInput(f"{path}: lists no poses: one row per pose is needed")
+    names = table.texts("pose")
+    table.unique(["pose"])
+    n = len(names)
+    if robot is None:
+        return Poses(path, names, table.rows, np.zeros((n, 0)), (None,) * n, np.zeros(n, bool), np.zeros((n, 0)))
+    joints = joint_columns(robot)
+    _check_joint_columns(table, [name for name, _ in joints])
+    q = np.column_stack([table.numbers(name) * factor for name, factor in joints])
+    if not to_predict:
+        _check_limits(table, robot, q)
+    notes: list[str] = []
+    approach, inferred = _approach(table, q, to_predict, notes)
+    known = {"pose", "payload", "set", *(name for name, _ in joints)}
+    known |= {f"approach{k}" for k in range(1, q.shape[1] + 1)}
+    return Poses(
+        path=path,
+        names=names,
+        rows=table.rows,
+        q=q,
+        payload=_payload(table, payloads),
+        verify=_verify(table),
+        approach=approach,
+        approach_inferred=inferred,
+        covariates=_covariates(table, known, notes),
+        notes=tuple(notes),
+    )
+
+
+def _check_joint_columns(table: Table, wanted: list[str]) -> None:
+    for name in wanted:
+        if name in table.columns:
+            continue
+        stem = name.split("_")[0]
+        other = [column for column in table.columns if column == stem or column.startswith(f"{stem}_")]
+        if other:
+            raise InvalidInput(
+                f"{table.path}, row 1: joint column '{other[0]}' must be '{name}': state the angle in degrees (a "
+                "sliding joint in mm) and name the column so"
+            )
+        table.require([name])
+    beyond = [c for c in table.columns if re.fullmatch(r"q\d+_(deg|mm)", c) and c not in wanted]
+    if beyond:
+        raise InvalidInput(
+            f"{table.path}, row 1: column '{beyond[0]}' has no joint: the robot has {len(wanted)} joints "
+            f"({', '.join(wanted)})"
+        )
+
+
+def _check_limits(table: Table, robot: RobotModel, q: Array) -> None:
+    for k, (joint, (column, factor)) in enumerate(zip(robot.joints, joint_columns(robot), strict=True)):
+        if joint.limits is None:
+            continue
+        low, high = joint.limits
+        outside = (q[:, k] < low - LIMIT_SLACK) | (q[:, k] > high + LIMIT_SLACK)
+        if outside.any():
+            i = int(np.argmax(outside))
+            unit = "mm" if joint.prismatic else "deg"
+            raise table.error(
+                i,
+                f"{column} = {q[i, k] / factor:g} {unit} lies outside the range {low / factor:g} to {high / factor:g} "
+                f"{unit} of {joint.name} ({int(outside.sum())} such poses): correct the angle, or the range in the "
+                "robot file",
+            )
+
+
+def _payload(table: Table, payloads: Collection[str]) -> tuple[str | None, ...]:
+    if "payload" not in table.columns:
+        return (None,) * len(table)
+    cells = table.columns["payload"]
+    for i, cell in enumerate(cells):
+        if cell not in payloads and cell.lower() not in NO_PAYLOAD:
+            remedy = proposal(cell, sorted(payloads)) or ": the campaign lists none"
+            raise table.error(i, f"payload '{cell[:60]}' is not known{remedy}; add it to 'payloads' in campaign.yaml")
+    return tuple(cell if cell in payloads else None for cell in cells)
+
+
+def _verify(table: Table) -> NDArray[np.bool_]:
+    if "set" not in table.columns:
+        return np.zeros(len(table), dtype=bool)
+    for i, cell in enumerate(table.columns["set"]):
+        if cell not in ("identify", "verify"):
+            raise table.error(i, f"set is {shown(cell)}, it must be 'identify' or 'verify'")
+    return np.array([cell == "verify" for cell in table.columns["set"]])
+
+
+def _approach(table: Table, q: Array, to_predict: bool, notes: list[str]) -> tuple[Array, bool]:
+    columns = [f"approach{k}" for k in range(1, q.shape[1] + 1)]
+    given = [name in table.columns for name in columns]
+    if to_predict:
+        approach = np.zeros_like(q)
+    else:
+        approach = approach_from_order(q)
+        if not all(given):
+            missing = ", ".join(name for name, there in zip(columns, given, strict=True) if not there)
+            notes.append(f"approach directions inferred from the order of the poses ({table.path.name}: no {missing})")
+    for k, name in enumerate(columns):
+        if given[k]:
+            values = table.numbers(name)
+            bad = ~np.isin(values, (-1.0, 0.0, 1.0))
+            if bad.any():
+                i = int(np.argmax(bad))
+                raise table.error(i, f"{name} is {table.columns[name][i]}, it must be -1, 0 or +1")
+            approach[:, k] = values
+    return approach, not to_predict and not all(given)
+
+
+def _covariates(table: Table, known: set[str], notes: list[str]) -> dict[str, Array]:
+    covariates: dict[str, Array] = {}
+    for name in table.columns:
+        if name in known:
+            continue
+        if name == "time_s" or re.fullmatch(r"temp_\w+_c", name):
+            covariates[name] = table.numbers(name)
+            continue
+        values = table.number_column(name)
+        if values is None:
+            notes.append(f"column '{name}' of {table.path.name} is not all numbers and is not used")
+        else:
+            covariates[name] = values
+    return covariates

@@ -1,0 +1,326 @@
+"""The run folder: the only place that knows where artifacts lie, whether they are up to date, and who may write.
+
+Every file is written to a temporary name and renamed. A stage is done when its record (``state/<stage>.json``) is there;
+the record is written last, so a run killed at any moment resumes with the stage it was in.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pipeline
+import robcal
+from pipeline import codec
+from pipeline.files import StorageError, sha256_of, storage_error, write_text
+from robcal.errors import InvalidInput, RobcalError
+
+try:
+    import fcntl
+except ImportError:  # Windows has no flock; runs there are not guarded against one another
+    fcntl = None  # type: ignore[assignment]
+
+RECORD_FORMAT = "robcal/stage-record-1"
+
+
+class RunLocked(RobcalError):
+    """Another process works in the run folder."""
+
+
+@dataclass(frozen=True)
+class StageRecord:
+    """What a finished stage left behind.
+
+    Attributes
+    ----------
+    key : hash of everything the stage depends on; outputs : file name in the run -> its hash.
+    result : the stage's part of result.json; notes : sentences about what was left out or assumed.
+    """
+
+    stage: str
+    key: str
+    outputs: Mapping[str, str]
+    result: Mapping[str, Any]
+    notes: tuple[str, ...] = ()
+    seconds: float = 0.0
+
+
+@dataclass
+class Run:
+    """A run folder and its artifacts.
+
+    Raises
+    ------
+    StorageError : from every writing method, when the disk is full or permission is missing.
+    """
+
+    folder: Path
+    _hashes: dict[str, tuple[int, int, str]] = field(default_factory=dict, repr=False)
+
+    @property
+    def report(self) -> Path:
+        """report.html"""
+        return self.folder / "report.html"
+
+    @property
+    def result(self) -> Path:
+        """result.json"""
+        return self.folder / "result.json"
+
+    @property
+    def diagnosis(self) -> Path:
+        """diagnosis.json"""
+        return self.folder / "diagnosis.json"
+
+    @property
+    def next_poses(self) -> Path:
+        """Poses that would tell apart what the diagnosis could not."""
+        return self.folder / "next_poses.csv"
+
+    @property
+    def robot(self) -> Path:
+        """robot_calibrated.yaml"""
+        return self.folder / "robot_calibrated.yaml"
+
+    @property
+    def covariance(self) -> Path:
+        """covariance.npz: names, theta, covariance of the calibrated robot."""
+        return self.folder / "covariance.npz"
+
+    @property
+    def points(self) -> Path:
+        """points.csv"""
+        return self.folder / "points.csv"
+
+    @property
+    def frames(self) -> Path:
+        """frames.csv"""
+        return self.folder / "frames.csv"
+
+    @property
+    def residuals(self) -> Path:
+        """residuals.csv"""
+        return self.folder / "residuals.csv"
+
+    @property
+    def log(self) -> Path:
+        """log.txt"""
+        return self.folder / "log.txt"
+
+    def body(self, name: str) -> Path:
+        """bodies/<name>.yaml"""
+        return self.folder / "bodies" / f"{_plain(name)}.yaml"
+
+    def camera(self, name: str) -> Path:
+        """cameras/<name>.yaml"""
+        return self.folder / "cameras" / f"{_plain(name)}.yaml"
+
+    def colmap(self, name: str) -> Path:
+        """Folder of a survey's network in COLMAP's text format."""
+        return self.folder / "colmap" / _plain(name)
+
+    def cache(self, name: str) -> Path:
+        """cache/<name>.npz: a stage's typed result."""
+        return self.folder / "cache" / f"{name}.npz"
+
+    def detections(self, key: str) -> Path:
+        """cache/detections/<key>.npz: targets found in one image."""
+        return self.folder / "cache" / "detections" / f"{key}.npz"
+
+    def save(self, name: str, value: object) -> Path:
+        """Store a typed result under a name; returns its path."""
+        path = self.cache(name)
+        codec.save(path, value)
+        return path
+
+    def load(self, name: str) -> Any:
+        """A typed result stored by :meth:`save`."""
+        return codec.load(self.cache(name))
+
+    def has(self, name: str) -> bool:
+        """Whether a typed result of this name is stored."""
+        return self.cache(name).is_file()
+
+    def record_path(self, stage: str) -> Path:
+        """state/<stage>.json"""
+        return self.folder / "state" / f"{stage}.json"
+
+    def record(self, stage: str) -> StageRecord | None:
+        """The record of a finished stage, None if it is not there or not readable."""
+        try:
+            data = json.loads(self.record_path(stage).read_text(encoding="utf-8"))
+            if data.get("format") != RECORD_FORMAT:
+                return None
+            return StageRecord(
+                data["stage"], data["key"], data["outputs"], data["result"], tuple(data["notes"]), data["seconds"]
+            )
+        except (OSError, ValueError, KeyError, TypeError, AttributeError):
+            return None
+
+    def write_record(self, record: StageRecord) -> None:
+        """Store the record of a finished stage: the last thing a stage does."""
+        data = {"format": RECORD_FORMAT, **record.__dict__, "notes": list(record.notes)}
+        write_json(self.record_path(record.stage), data)
+
+    def forget(self, stage: str) -> None:
+        """Remove the record of a stage, so that it runs again."""
+        try:
+            self.record_path(stage).unlink(missing_ok=True)
+        except OSError as error:
+            raise storage_error(self.record_path(stage), error) from None
+
+    def up_to_date(self, stage: str, key: str) -> bool:
+        """Whether the stage ran with this key and its outputs are still what it wrote."""
+        record = self.record(stage)
+        if record is None or record.key != key:
+            return False
+        for name, digest in record.outputs.items():
+            path = self.folder / name
+            if not path.is_file() or self.hash(path) != digest:
+                return False
+        return True
+
+    def outputs(self, paths: Sequence[Path]) -> dict[str, str]:
+        """Names and hashes of files of this run."""
+        return {str(path.relative_to(self.folder)): self.hash(path) for path in paths}
+
+    def hash(self, path: Path) -> str:
+        """SHA-256 of a file; remembered while size and time of change stay the same."""
+        try:
+            status = path.stat()
+        except OSError as error:
+            raise InvalidInput(f"{path}: cannot be read: {error.strerror or error}") from None
+        name = str(path.resolve())
+        known = self._hashes.get(name)
+        if known and known[:2] == (status.st_size, status.st_mtime_ns):
+            return known[2]
+        digest = sha256_of(path)
+        self._hashes[name] = (status.st_size, status.st_mtime_ns, digest)
+        return digest
+
+    def load_hashes(self) -> None:
+        """Take over the hashes remembered by the last run."""
+        try:
+            data = json.loads((self.folder / "cache" / "hashes.json").read_text(encoding="utf-8"))
+            self._hashes.update({name: (int(a), int(b), str(c)) for name, (a, b, c) in data.items()})
+        except (OSError, ValueError, TypeError, AttributeError):
+            self._hashes.clear()  # only a saving of time is lost
+
+    def save_hashes(self) -> None:
+        """Remember hashes for the next run."""
+        write_json(self.folder / "cache" / "hashes.json", {k: list(v) for k, v in self._hashes.items()})
+
+    def write_result(self, data: Mapping[str, Any]) -> None:
+        """result.json"""
+        write_json(self.result, data)
+
+    def load_result(self) -> dict[str, Any]:
+        """Content of result.json."""
+        return read_json(self.result)
+
+    @contextmanager
+    def lock(self) -> Iterator[None]:
+        """Hold the run folder for this process; released by the system even after kill -9.
+
+        Raises
+        ------
+        RunLocked : another process holds it.
+        """
+        path = self.folder / ".lock"
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            stream = path.open("a")
+        except OSError as error:
+            raise storage_error(self.folder, error) from None
+        with stream:
+            if fcntl is not None:
+                try:
+                    fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                except BlockingIOError:
+                    raise RunLocked(
+                        f"{self.folder}: another run works in this folder: wait for it, or choose another with --out"
+                    ) from None
+            yield
+
+
+def _plain(name: str) -> str:
+    if not name or name in {".", ".."} or any(c in name for c in "/\\\0"):
+        raise InvalidInput(f"'{name}' cannot be the name of a body or camera: it names a file, use letters and digits")
+    return name
+
+
+def write_json(path: Path, data: Mapping[str, Any]) -> None:
+    """Write JSON atomically; numbers that are not finite become null."""
+    write_text(path, json.dumps(plain(data), indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a JSON object written by this program.
+
+    Raises
+    ------
+    InvalidInput : missing or damaged.
+    """
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InvalidInput(f"{path}: no such file: run the campaign first") from None
+    except (OSError, ValueError) as error:
+        raise InvalidInput(f"{path}: damaged ({error}): run the campaign again") from None
+    if not isinstance(data, dict):
+        raise InvalidInput(f"{path}: damaged: run the campaign again")
+    return data
+
+
+def plain(value: Any) -> Any:
+    """Data that JSON can hold: numpy scalars and arrays to numbers and lists, not finite numbers to None."""
+    if isinstance(value, Mapping):
+        return {str(k): plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple | set | frozenset):
+        return [plain(v) for v in value]
+    if hasattr(value, "tolist"):
+        return plain(value.tolist())
+    if isinstance(value, float):
+        return value if value == value and abs(value) != float("inf") else None
+    if isinstance(value, Path):
+        return str(value)
+    return value
+
+
+@cache
+def code_version(*parts: str) -> str:
+    """Hash of the sources of packages or modules, such as ``robcal/imaging`` or ``pipeline/stages/detect.py``."""
+    roots = {"robcal": Path(robcal.__file__).parent, "pipeline": Path(pipeline.__file__).parent}
+    digest = hashlib.sha256()
+    for part in parts:
+        top, _, rest = part.partition("/")
+        place = roots[top] / rest if rest else roots[top]
+        for file in sorted(place.rglob("*.py")) if place.is_dir() else [place]:
+            digest.update(str(file.relative_to(roots[top])).encode())
+            digest.update(file.read_bytes())
+    return digest.hexdigest()
+
+
+def fingerprint(*pieces: Any) -> str:
+    """Hash of plain data."""
+    text = json.dumps(plain(list(pieces)), sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+__all__ = [
+    "Run",
+    "RunLocked",
+    "StageRecord",
+    "StorageError",
+    "code_version",
+    "fingerprint",
+    "plain",
+    "read_json",
+    "write_json",
+]

@@ -1,0 +1,215 @@
+"""CSV tables of people: comma, decimal point, one header line; every problem in one sentence with file and row.
+
+Read: UTF-8 with or without byte order mark, any line ending, blank lines. Refused with a remedy: semicolons and decimal
+commas, other encodings, missing or doubled columns, rows of another length, text or NaN where a number is needed.
+Rows are counted as in an editor: the header is row 1.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.files import read_bytes, write_text
+from pipeline.schemas import proposal, shown
+from robcal.errors import InvalidInput
+from robcal.transforms import Array
+
+MAX_BYTES = 400_000_000
+MAX_ROWS = 5_000_000
+MAX_CELL = 10_000
+MISSING = frozenset({"", "nan", "na", "n/a", "null", "none", "-"})
+
+
+@dataclass(frozen=True)
+class Table:
+    """A CSV file as text columns.
+
+    Attributes
+    ----------
+    columns : name -> cells, stripped of blanks.
+    rows : row number in the file of each record.
+    """
+
+    path: Path
+    columns: Mapping[str, tuple[str, ...]]
+    rows: NDArray[np.int64] = field(repr=False)
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def has(self, *names: str) -> bool:
+        """Whether all these columns are there."""
+        return all(name in self.columns for name in names)
+
+    def error(self, record: int, message: str) -> InvalidInput:
+        """An error that names file and row."""
+        return InvalidInput(f"{self.path}, row {int(self.rows[record])}: {message}")
+
+    def require(self, names: Sequence[str]) -> None:
+        """Raise InvalidInput if a column is missing."""
+        for name in names:
+            if name not in self.columns:
+                have = list(self.columns)
+                needed = ", ".join(names)
+                raise InvalidInput(
+                    f"{self.path}, row 1: column '{name}' is missing{proposal(name, have)}: needed are {needed}"
+                )
+
+    def texts(self, name: str) -> tuple[str, ...]:
+        """A column of names, none empty."""
+        self.require([name])
+        for i, cell in enumerate(self.columns[name]):
+            if not cell:
+                raise self.error(i, f"{name} is empty: give a name or remove the row")
+        return self.columns[name]
+
+    def numbers(self, name: str, *, positive: bool = False) -> Array:
+        """A column of finite numbers.
+
+        Raises
+        ------
+        InvalidInput : a cell is empty, NaN, infinite or text; with ``positive`` also where it is not above zero.
+        """
+        self.require([name])
+        cells = self.columns[name]
+        try:
+            values = np.array([float(cell) for cell in cells], dtype=float)
+        except ValueError:
+            values = np.array([_float_or_nan(cell) for cell in cells], dtype=float)
+        bad = ~np.isfinite(values)
+        if bad.any():
+            i = int(np.argmax(bad))
+            raise self.error(i, f"{name} is {_bad_number(cells[i])}: give a finite number or remove the row")
+        if positive and (values <= 0).any():
+            i = int(np.argmax(values <= 0))
+            raise self.error(i, f"{name} is {cells[i]}, it must be larger than zero: correct it or remove the column")
+        return values
+
+    def whole_numbers(self, name: str) -> NDArray[np.int64]:
+        """A column of whole numbers."""
+        values = self.numbers(name)
+        bad = (values != np.round(values)) | (np.abs(values) > 2**53)
+        if bad.any():
+            i = int(np.argmax(bad))
+            raise self.error(i, f"{name} is {shown(self.columns[name][i])}, it must be a whole number")
+        return values.astype(np.int64)
+
+    def number_column(self, name: str) -> Array | None:
+        """A column of numbers if every cell is one, None if not (an unknown column of text)."""
+        values = np.array([_float_or_nan(cell) for cell in self.columns[name]], dtype=float)
+        return values if np.isfinite(values).all() and len(values) else None
+
+    def unique(self, names: Sequence[str]) -> None:
+        """Raise InvalidInput if two rows agree in these columns."""
+        seen: dict[tuple[str, ...], int] = {}
+        for i, key in enumerate(zip(*(self.columns[name] for name in names), strict=True)):
+            if key in seen:
+                what = ", ".join(f"{name} {cell}" for name, cell in zip(names, key, strict=True))
+                first = int(self.rows[seen[key]])
+                raise self.error(i, f"{what} stands twice (first in row {first}): remove one of them")
+            seen[key] = i
+
+
+def _float_or_nan(cell: str) -> float:
+    try:
+        return float(cell)
+    except ValueError:
+        return math.nan
+
+
+def _bad_number(cell: str) -> str:
+    if cell.lower() in MISSING:
+        return "missing (empty or NaN)"
+    if cell.lower().lstrip("+-") in {"inf", "infinity"}:
+        return "infinite"
+    return f"{shown(cell)}, not a number"
+
+
+def read_table(path: Path) -> Table:
+    """Read a CSV file.
+
+    Raises
+    ------
+    InvalidInput : unreadable, other separators or encodings, doubled columns, ragged rows.
+    """
+    raw = read_bytes(path, MAX_BYTES)
+    if raw[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        raise InvalidInput(f"{path}: is UTF-16 text: save it as 'CSV UTF-8'")
+    if b"\x00" in raw[:4096]:
+        raise InvalidInput(f"{path}: is not a text file: a CSV table is needed")
+    try:
+        text = raw.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        row = raw[: error.start].count(b"\n") + 1
+        raise InvalidInput(f"{path}, row {row}: is not UTF-8 text: save it as 'CSV UTF-8'") from None
+    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
+    header: list[str] | None = None
+    records: list[list[str]] = []
+    rows: list[int] = []
+    start = 1
+    try:
+        for record in reader:
+            row, start = start, reader.line_num + 1
+            if not record or all(not cell.strip() for cell in record):
+                continue
+            if header is None:
+                header = _header(path, row, record)
+                continue
+            if len(record) > len(header) and not any(cell.strip() for cell in record[len(header) :]):
+                record = record[: len(header)]
+            if len(record) != len(header):
+                raise InvalidInput(
+                    f"{path}, row {row}: has {len(record)} cells where the header has {len(header)}: "
+                    "add or remove cells (decimal point, not comma)"
+                )
+            records.append([cell.strip() for cell in record])
+            rows.append(row)
+            if len(rows) > MAX_ROWS:
+                raise InvalidInput(f"{path}: has more than {MAX_ROWS} rows: split it into campaigns")
+    except csv.Error as error:
+        raise InvalidInput(f"{path}, row {reader.line_num}: not a CSV table: {error}") from None
+    if header is None:
+        raise InvalidInput(f"{path}: is empty: the first row must name the columns")
+    by_column = zip(*records, strict=True) if records else [() for _ in header]
+    columns = {name: tuple(cells) for name, cells in zip(header, by_column, strict=True)}
+    return Table(path, columns, np.array(rows, dtype=np.int64))
+
+
+def _header(path: Path, row: int, record: list[str]) -> list[str]:
+    names = [cell.strip() for cell in record]
+    if len(names) == 1 and (";" in names[0] or "\t" in names[0]):
+        mark = "semicolons" if ";" in names[0] else "tabs"
+        raise InvalidInput(f"{path}, row {row}: columns are separated by {mark}: use commas, and a decimal point")
+    while names and not names[-1]:
+        names.pop()
+    for i, name in enumerate(names):
+        if not name:
+            raise InvalidInput(f"{path}, row {row}: column {i + 1} has no name: name or remove it")
+        if len(name) > MAX_CELL:
+            raise InvalidInput(f"{path}, row {row}: the name of column {i + 1} has {len(name)} characters")
+        if names.index(name) != i:
+            raise InvalidInput(f"{path}, row {row}: column '{name}' stands twice: remove or rename one of them")
+    return names
+
+
+def table_text(columns: Mapping[str, Iterable[object]]) -> str:
+    """CSV text; floats with the digits given by their strings or, if floats, with twelve significant ones."""
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(columns.keys())
+    for row in zip(*columns.values(), strict=True):
+        writer.writerow([f"{cell:.12g}" if isinstance(cell, float) else cell for cell in row])
+    return stream.getvalue()
+
+
+def write_table(path: Path, columns: Mapping[str, Iterable[object]]) -> None:
+    """Write a CSV file atomically."""
+    write_text(path, table_text(columns))
