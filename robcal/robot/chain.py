@@ -2,8 +2,8 @@
 
 Every joint of a :class:`~robcal.robot.model.RobotModel` (rotary about x, y or z, or sliding, with any fixed angles
 before and after it) is a screw about a line that stands still while the joints before it are at zero. With those lines
-``base_T_flange = E_1(q_1) ... E_N(q_N) M`` (product of exponentials; Murray, Li, Sastry 1994, section 3.2), which is the
-form in which inverse kinematics sees the structure of a robot whatever parametrisation its file uses.
+``base_T_flange = E_1(q_1) ... E_N(q_N) M`` (product of exponentials; Murray, Li, Sastry 1994, section 3.2), the form in
+which inverse kinematics sees the structure of a robot whatever parametrisation its file uses.
 
 Only nominal geometry lives here. Deviations, elasticities and terms are the kernel's business.
 """
@@ -13,7 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from robcal.errors import InvalidInput
 from robcal.robot.model import RobotModel
@@ -37,12 +37,12 @@ class Chain:
     """
 
     names: tuple[str, ...]
-    prismatic: Array
+    prismatic: NDArray[np.bool_]
     axes: Array
     points: Array
     home: Array
     frames_home: Array
-    moved_by: Array
+    moved_by: NDArray[np.int_]
     lower: Array
     upper: Array
 

@@ -10,18 +10,21 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from robcal.errors import InvalidInput
 from robcal.robot.chain import Chain, chain_of, check_joint_angles, forward, forward_and_jacobian, limit_excess
 from robcal.robot.inverse_analytic import solve_parallel_arm, solve_spherical_wrist
-from robcal.robot.inverse_numeric import NumericSettings, nearest_pose, search
+from robcal.robot.inverse_numeric import BoolArray, NumericSettings, nearest_pose, search
 from robcal.robot.model import RobotModel
 from robcal.robot.structure import SphericalWrist, Structure, find_structure
 from robcal.transforms import Array, difference
 
 SINGULAR_CONDITION = 1e-4
-"""Ratio of the smallest to the largest singular value of the Jacobian below which a configuration counts as singular."""
+"""Smallest over largest singular value of the Jacobian below which a configuration counts as singular."""
+
+EXPLAINED = 25
+"""So many unreachable frames of one request are explained one by one."""
 
 _LIMIT_SLACK = 1e-9
 
@@ -45,12 +48,12 @@ class InverseSolutions:
     base_T_flange: Array
     near: Array
     q: Array
-    within_limits: Array
+    within_limits: BoolArray
     excess: Array
     method: str
 
     @property
-    def count(self) -> Array:
+    def count(self) -> NDArray[np.int_]:
         """Number of branches within limits, (n,)."""
         return np.sum(self.within_limits, axis=1)
 
@@ -60,7 +63,7 @@ class Selection:
     """One configuration a frame: q (n, N), NaN where none; reachable (n,); reason (n) in words, None if reachable."""
 
     q: Array
-    reachable: Array
+    reachable: BoolArray
     reason: tuple[str | None, ...] = field(repr=False)
 
     def require(self, what: str = "frame") -> Array:
@@ -83,7 +86,7 @@ def inverse_kinematics(
     near: ArrayLike | None = None,
     *,
     all_branches: bool = True,
-    settings: NumericSettings = NumericSettings(),
+    settings: NumericSettings | None = None,
 ) -> InverseSolutions:
     """All joint configurations that bring the nominal flange to frames (n, 4, 4) or (4, 4) in base coordinates.
 
@@ -111,7 +114,7 @@ def inverse_kinematics(
     structure = find_structure(rest) if rest is not None else None
     if rest is not None and structure is not None:
         return _on_track(chain, rest, structure, frames, start)
-    q, _ = search(chain, frames, start, settings, all_branches=all_branches)
+    q = search(chain, frames, start, settings or NumericSettings(), all_branches=all_branches)
     return _finish(chain, frames, start, q, "numeric")
 
 
@@ -128,8 +131,9 @@ def select(solutions: InverseSolutions, near: ArrayLike | None = None, *, explai
     chosen = np.where(reachable[:, None], q[rows, best], np.nan)
     reasons: list[str | None] = [None] * len(q)
     if explain:
-        for i in np.flatnonzero(~reachable):
-            reasons[i] = explain_unreachable(solutions, int(i))
+        for k, i in enumerate(np.flatnonzero(~reachable)):
+            # the nearest pose costs a search: enough of them is enough
+            reasons[i] = explain_unreachable(solutions, int(i)) if k < EXPLAINED else "out of reach or beyond a limit"
     return Selection(chosen, reachable, tuple(reasons))
 
 
@@ -165,12 +169,13 @@ def explain_unreachable(solutions: InverseSolutions, row: int) -> str:
         for j in np.flatnonzero(np.abs(solutions.excess[row, k]) > _LIMIT_SLACK):
             amount = solutions.excess[row, k, j]
             text = f"{1e3 * abs(amount):.2f} mm" if chain.prismatic[j] else f"{np.rad2deg(abs(amount)):.2f} deg"
-            parts.append(f"{chain.names[j]} would be {text} {'above its upper' if amount > 0 else 'below its lower'} limit")
+            side = "above its upper" if amount > 0 else "below its lower"
+            parts.append(f"{chain.names[j]} would be {text} {side} limit")
         return "joint limits: in the most favourable configuration " + " and ".join(parts)
     _, twist = nearest_pose(chain, solutions.base_T_flange[row], solutions.near[row], NumericSettings(iterations=60))
     return (
-        f"outside the workspace: within its limits the robot comes no nearer than {1e3 * np.linalg.norm(twist[:3]):.2f} mm "
-        f"and {np.rad2deg(np.linalg.norm(twist[3:])):.3f} deg"
+        "outside the workspace: within its limits the robot comes no nearer than "
+        f"{1e3 * np.linalg.norm(twist[:3]):.2f} mm and {np.rad2deg(np.linalg.norm(twist[3:])):.3f} deg"
     )
 
 
@@ -256,16 +261,16 @@ def _turn_near(chain: Chain, q: Array, near: Array) -> tuple[Array, Array]:
     turn = 2.0 * np.pi
     rotary = ~chain.prismatic
     best = np.where(rotary, q - turn * np.round((q - near) / turn), q)
-    too_high = np.where(rotary & (best > chain.upper + _LIMIT_SLACK), np.ceil((best - chain.upper - _LIMIT_SLACK) / turn), 0)
-    too_low = np.where(rotary & (best < chain.lower - _LIMIT_SLACK), np.ceil((chain.lower - _LIMIT_SLACK - best) / turn), 0)
-    moved = best - turn * np.nan_to_num(too_high) + turn * np.nan_to_num(too_low)
+    high, low = best - chain.upper - _LIMIT_SLACK, chain.lower - _LIMIT_SLACK - best
+    turns = np.where(rotary & (high > 0), -np.ceil(high / turn), np.where(rotary & (low > 0), np.ceil(low / turn), 0.0))
+    moved = best + turn * turns
     excess = limit_excess(chain, moved)
     other = limit_excess(chain, best)
     stay = np.abs(other) < np.abs(excess)
     return np.where(stay, best, moved), np.where(stay, other, excess)
 
 
-def _respects(q: Array, excess: Array) -> Array:
+def _respects(q: Array, excess: Array) -> BoolArray:
     return np.all(np.isfinite(q), axis=-1) & np.all(np.abs(np.nan_to_num(excess)) <= _LIMIT_SLACK, axis=-1)
 
 
@@ -285,7 +290,7 @@ def _without_track(chain: Chain) -> Chain | None:
 
 
 def _on_track(chain: Chain, arm: Chain, structure: Structure, frames: Array, near: Array) -> InverseSolutions:
-    """The arm's branches with the track where ``near`` has it; where that fails, at the nearest place where one exists."""
+    """The arm's branches with the track where ``near`` has it; failing that, at the nearest place where one exists."""
     q = _at_track(chain, arm, structure, frames, near, near[:, 0])
     result = _finish(chain, frames, near, q, "")
     rows = np.flatnonzero(result.count == 0)

@@ -9,14 +9,18 @@ continuum of which the one near each start is found.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.stats import qmc
 
 from robcal.robot.chain import Chain, forward_and_jacobian
 from robcal.transforms import Array, difference
 
+BoolArray = NDArray[np.bool_]
+Evaluate = Callable[[Array, NDArray[np.int_]], tuple[Array, Array]]
 
 @dataclass(frozen=True)
 class NumericSettings:
@@ -28,12 +32,27 @@ class NumericSettings:
     iterations : most steps from one start.
     tolerance : norm of the weighted twist at which a frame counts as reached, m.
     rotation_length : m; one radian of rotation counts as much as this length.
+    tilt_tolerance : rad; an arm of fewer than six joints cannot follow every orientation: it takes the position exactly
+        and comes as near as it can in orientation, and that counts as reached up to this angle.
     """
 
     starts: int = 48
     iterations: int = 80
     tolerance: float = 1e-9
     rotation_length: float = 0.3
+    tilt_tolerance: float = 0.02
+
+    def weight(self, chain: Chain) -> Array:
+        """Weights (6,) of a twist; with fewer than six joints position goes before orientation."""
+        length = self.rotation_length if chain.n_joints >= 6 else 1e-3
+        return np.array([1.0] * 3 + [length] * 3)
+
+    def reached(self, chain: Chain, twist: Array) -> BoolArray:
+        """Whether frames with these twists (n, 6) left count as reached."""
+        if chain.n_joints >= 6:
+            return np.linalg.norm(self.weight(chain) * twist, axis=-1) < self.tolerance
+        position, turn = np.linalg.norm(twist[:, :3], axis=1), np.linalg.norm(twist[:, 3:], axis=1)
+        return (position < 1e-7) & (turn < self.tilt_tolerance)
 
 
 def start_configurations(chain: Chain, count: int) -> Array:
@@ -49,18 +68,26 @@ def start_configurations(chain: Chain, count: int) -> Array:
 
 
 def refine(
-    chain: Chain, base_T_flange: Array, start: Array, settings: NumericSettings, *, within_limits: bool = False
+    chain: Chain,
+    base_T_flange: Array,
+    start: Array,
+    settings: NumericSettings,
+    *,
+    within_limits: bool = False,
+    evaluate: Evaluate | None = None,
 ) -> tuple[Array, Array]:
     """Joint values (n, N) that bring each row's flange as near as possible to its frame, and the twist left (n, 6).
 
     ``within_limits`` keeps every step inside the joint limits (a projected step), for the nearest reachable pose.
+    ``evaluate(q, rows)`` gives frames and their right-twist Jacobian for the given rows; default: the nominal chain.
     """
+    at: Evaluate = evaluate if evaluate is not None else lambda values, _: forward_and_jacobian(chain, values)
     q = np.array(start, dtype=float)
     if within_limits:
         q = np.clip(q, chain.lower, chain.upper)
-    weight = np.array([1.0] * 3 + [settings.rotation_length] * 3)
+    weight = settings.weight(chain)
     damping = np.full(len(q), 1e-3)
-    T, J = forward_and_jacobian(chain, q)
+    T, J = at(q, np.arange(len(q)))
     r = difference(T, base_T_flange)
     cost = np.sum((weight * r) ** 2, axis=1)
     active = np.arange(len(q))
@@ -84,7 +111,7 @@ def refine(
         trial = q[active] + step * np.minimum(1.0, 1.0 / np.maximum(largest, 1e-300))
         if within_limits:
             trial = np.clip(trial, chain.lower, chain.upper)
-        T_new, J_new = forward_and_jacobian(chain, trial)
+        T_new, J_new = at(trial, active)
         r_new = difference(T_new, base_T_flange[active])
         cost_new = np.sum((weight * r_new) ** 2, axis=1)
         better = cost_new < cost[active]
@@ -96,15 +123,15 @@ def refine(
 
 def search(
     chain: Chain, base_T_flange: Array, near: Array, settings: NumericSettings, *, all_branches: bool
-) -> tuple[Array, Array]:
-    """Solutions (n, B, N), padded with NaN, and whether they are complete searches (n,).
+) -> Array:
+    """Solutions (n, B, N), padded with NaN.
 
     The start near the given configuration comes first; further starts are spent on rows it does not solve, or on all
     rows with ``all_branches``.
     """
     n, count = len(base_T_flange), chain.n_joints
     q, r = refine(chain, base_T_flange, near, settings)
-    solved = _norm(r, settings) < settings.tolerance
+    solved = settings.reached(chain, r)
     inside = np.all((q >= chain.lower - 1e-9) & (q <= chain.upper + 1e-9), axis=1)
     rows = np.arange(n) if all_branches else np.flatnonzero(~(solved & inside))
     found: list[list[Array]] = [[q[i]] if solved[i] else [] for i in range(n)]
@@ -112,7 +139,7 @@ def search(
         starts = start_configurations(chain, settings.starts)
         many = np.repeat(rows, len(starts))
         q_many, r_many = refine(chain, base_T_flange[many], np.tile(starts, (len(rows), 1)), settings)
-        good = _norm(r_many, settings) < settings.tolerance
+        good = settings.reached(chain, r_many)
         for i, solution in zip(many[good], q_many[good], strict=True):
             if not any(_same(chain, solution, known) for known in found[i]):
                 found[i].append(solution)
@@ -121,7 +148,7 @@ def search(
     for i, solutions in enumerate(found):
         for k, solution in enumerate(solutions):
             out[i, k] = solution
-    return out, solved
+    return out
 
 
 def nearest_pose(chain: Chain, base_T_flange: Array, near: Array, settings: NumericSettings) -> tuple[Array, Array]:
@@ -129,13 +156,8 @@ def nearest_pose(chain: Chain, base_T_flange: Array, near: Array, settings: Nume
     starts = np.vstack([near[None], start_configurations(chain, settings.starts)])
     frames = np.broadcast_to(base_T_flange, (len(starts), 4, 4))
     q, r = refine(chain, frames, starts, settings, within_limits=True)
-    best = int(np.argmin(_norm(r, settings)))
+    best = int(np.argmin(np.linalg.norm(settings.weight(chain) * r, axis=1)))
     return q[best], r[best]
-
-
-def _norm(r: Array, settings: NumericSettings) -> Array:
-    weight = np.array([1.0] * 3 + [settings.rotation_length] * 3)
-    return np.linalg.norm(weight * r, axis=-1)
 
 
 def _same(chain: Chain, a: Array, b: Array) -> bool:

@@ -1,0 +1,246 @@
+"""What to command so that the real robot's tool comes where it is wanted.
+
+Source of the first-order command: thesis section 3.6. With the nominal inverse ``K^-1`` and the real forward model
+``Kr`` (geometry, elasticity under the payload, all extra terms): ``Fh = Kr(K^-1(F))``, ``F* = F Fh^-1 F``, command
+``K^-1(F*)``. It is exact if real and nominal robot differ by one constant frame on one side. The exact inverse repeats
+the step on its own result, ``F* <- F* Fh^-1 F``, until the real model is at F; each round gains about the factor by
+which the real robot differs from the nominal one (1e-3).
+
+Frames: the controller believes ``world_T_tool = world_T_base K(q) flange_T_tool`` with the calibrated cell (base and
+tool frames of the model, deviations included); ``F`` is a flange frame in that base.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from robcal.errors import InvalidInput
+from robcal.robot.chain import Chain, chain_of, forward
+from robcal.robot.inverse import Selection, check_frames, follow, inverse_kinematics, select
+from robcal.robot.inverse_numeric import BoolArray, NumericSettings, refine
+from robcal.robot.kernel import Kernel, PoseInputs
+from robcal.robot.model import GEOMETRIC_KINDS, RobotModel
+from robcal.transforms import Array, difference, frame_from_xyzrpy, invert
+
+Rows = NDArray[np.int_]
+Method = Literal["exact", "first_order", "none"]
+
+
+@dataclass(frozen=True)
+class CompensationSettings:
+    """Settings of the compensation.
+
+    Attributes
+    ----------
+    method : 'exact' (iterated), 'first_order' (one step, as in a controller) or 'none' (nominal command).
+    iterations : most steps of the exact inverse.
+    tolerance : m and rad; largest component of the tool's remaining twist at which the iteration stops.
+    as_path : True chooses each configuration near the one before it, False near ``near`` alone.
+    """
+
+    method: Method = "exact"
+    iterations: int = 25
+    tolerance: float = 1e-10
+    as_path: bool = False
+
+
+@dataclass(frozen=True)
+class Compensation:
+    """Commands for n wanted frames.
+
+    Attributes
+    ----------
+    q : (n, N) joint values to command, rad or m; NaN where not reachable.
+    F_star : (n, 4, 4) corrected target: the tool frame to command to a controller that believes the nominal robot, in
+        the coordinates of the request (world or base); NaN where not reachable.
+    remaining : (n, 6) twist (rho, omega) from the wanted tool frame to where the real model then is, tool coordinates.
+    before : (n, 6) the same without compensation (the nominal command).
+    reachable : (n,); reason : in words where not, None where reachable.
+    converged : (n,) the remaining twist (position alone for fewer than six joints) is below ten times the tolerance.
+    steps : number of corrections made.
+    """
+
+    q: Array
+    F_star: Array
+    remaining: Array
+    before: Array
+    reachable: BoolArray
+    reason: tuple[str | None, ...] = field(repr=False)
+    converged: BoolArray = field(repr=False)
+    steps: int
+
+    def require(self) -> Compensation:
+        """The same compensation.
+
+        Raises
+        ------
+        InvalidInput : a frame is not reachable; the message names the first one and says why.
+        """
+        Selection(self.q, self.reachable, self.reason).require()
+        return self
+
+
+def cell_frames(kernel: Kernel) -> tuple[Array, Array]:
+    """Calibrated world_T_base and flange_T_tool (4, 4), the model's deviations of base and tool included."""
+    theta = dict(zip(kernel.names, kernel.theta0, strict=True))
+    base = frame_from_xyzrpy([theta[f"base.{k}"] for k in GEOMETRIC_KINDS])
+    tool = frame_from_xyzrpy([theta[f"tool.{k}"] for k in GEOMETRIC_KINDS])
+    return kernel.world_T_base @ base, kernel.flange_T_tool @ tool
+
+
+def compensate(
+    robot: RobotModel | Kernel,
+    wanted: ArrayLike,
+    *,
+    payload: Sequence[str | None] | str | None = None,
+    covariates: Mapping[str, ArrayLike] | None = None,
+    near: ArrayLike | None = None,
+    frame: Literal["world", "base"] = "world",
+    settings: CompensationSettings | None = None,
+) -> Compensation:
+    """Joint values (and corrected targets) that bring the real tool to the wanted frames.
+
+    Parameters
+    ----------
+    robot : calibrated robot (parameters filled) or a kernel of it.
+    wanted : (n, 4, 4) tool frames in the measuring system's coordinates, or in base coordinates with ``frame='base'``.
+    payload : name per frame, one for all, or None.
+    covariates : columns (n,) that the model's terms need; approach directions default to 0.
+    near : (N,) or (n, N) configuration to stay near to; default the middle of the limits.
+
+    Raises
+    ------
+    InvalidInput : frames that are not rigid, unknown payload, missing covariate. Frames out of reach are no error:
+        they are marked, with the reason (call ``require()`` to insist).
+    """
+    options = settings or CompensationSettings()
+    kernel = robot if isinstance(robot, Kernel) else Kernel(robot)
+    if options.iterations < 1 or options.tolerance <= 0:
+        raise InvalidInput("compensation needs at least one iteration and a positive tolerance")
+    if frame not in ("world", "base"):
+        raise InvalidInput(f"frames can be given in 'world' or 'base' coordinates, not '{frame}'")
+    world_T_base, flange_T_tool = cell_frames(kernel)
+    nominal = chain_of(kernel.model)
+    # the tool belongs to the chain: arms of fewer than six joints give the tool's position precedence, not the flange's
+    chain = replace(nominal, home=nominal.home @ flange_T_tool)
+    given = check_frames(wanted)
+    target = given if frame == "world" else world_T_base @ given
+    F = invert(world_T_base) @ target
+    solutions = inverse_kinematics(chain, F, near, all_branches=False)
+    chosen = follow(solutions, solutions.near[0]) if options.as_path and len(F) else select(solutions)
+    every = kernel.poses(np.where(chosen.reachable[:, None], chosen.q, solutions.near), payload, covariates)
+    state = _State(chosen.q.copy(), F.copy(), list(chosen.reason), np.full((len(F), 6), np.nan))
+    rows = np.flatnonzero(chosen.reachable)
+    state.remaining[rows] = _twist(kernel, every.subset(rows), target[rows])
+    before = state.remaining.copy()
+    steps = 0
+    most = {"exact": options.iterations, "first_order": 1, "none": 0}[options.method]
+    size = _size(chain, before)
+    while steps < most and len(rows):
+        steps += 1
+        moved = _correct(kernel, chain, state, every, F, rows, world_T_base)
+        rows = rows[moved]
+        state.remaining[rows] = _twist(kernel, every.subset(rows).with_q(state.q[rows]), target[rows])
+        new = _size(chain, state.remaining[rows])
+        # a loop that gains nothing ends
+        going = (new > options.tolerance) & ((new < 0.9 * size[rows]) | (steps < 3))
+        size[rows] = np.minimum(size[rows], new)
+        rows = rows[going]
+    if options.method == "exact":
+        _search_on(kernel, chain, state, every, target, solutions.near, options)
+    reachable = np.all(np.isfinite(state.q), axis=1)
+    F_star = np.full_like(F, np.nan)
+    if np.any(reachable):
+        # the command's own target: where the nominal robot's tool is with these joint values
+        tool = forward(chain, state.q[reachable])
+        F_star[reachable] = tool if frame == "base" else world_T_base @ tool
+    state.remaining[~reachable] = np.nan
+    with np.errstate(invalid="ignore"):
+        converged = _size(chain, state.remaining) <= 10.0 * options.tolerance
+    return Compensation(
+        state.q, F_star, state.remaining, before, reachable, tuple(state.reason), converged, steps
+    )  # fmt: skip
+
+
+@dataclass
+class _State:
+    q: Array
+    F_star: Array
+    reason: list[str | None]
+    remaining: Array
+
+
+def _size(chain: Chain, twist: Array) -> Array:
+    """Largest component of twists (n, 6); of their positions alone where orientation cannot be followed."""
+    return np.max(np.abs(twist[:, :3] if chain.n_joints < 6 else twist), axis=1, initial=0.0)
+
+
+def _twist(kernel: Kernel, poses: PoseInputs, target: Array) -> Array:
+    return difference(target, kernel.frames(kernel.theta0, poses))
+
+
+def _correct(
+    kernel: Kernel, chain: Chain, state: _State, every: PoseInputs, F: Array, rows: Rows, world_T_base: Array
+) -> BoolArray:
+    """One correction of the given rows in place; False where the corrected target is out of reach."""
+    if not len(rows):
+        return np.zeros(0, bool)
+    q = state.q[rows]
+    Fh = invert(world_T_base) @ kernel.frames(kernel.theta0, every.subset(rows).with_q(q))
+    if chain.n_joints < 6:
+        # Fewer than six joints: the target's unreachable part must not pile up in F*, so the correction is made in
+        # joint space, q <- q + K^-1(F) - K^-1(Fh).
+        here = select(inverse_kinematics(chain, Fh, q, all_branches=False), explain=False)
+        there = select(inverse_kinematics(chain, F[rows], q, all_branches=False), explain=False)
+        new = q + there.q - here.q
+        moved = np.all((new >= chain.lower - 1e-9) & (new <= chain.upper + 1e-9), axis=1)
+        reasons: list[str | None] = ["the correction leads beyond a joint limit or out of the workspace"] * len(rows)
+        new = np.where(moved[:, None], new, np.nan)
+    else:
+        state.F_star[rows] = state.F_star[rows] @ invert(Fh) @ F[rows]
+        chosen = select(inverse_kinematics(chain, state.F_star[rows], q, all_branches=False))
+        new, moved = chosen.q, chosen.reachable
+        reasons = [None if r is None else f"the frame is, but its corrected target is not: {r}" for r in chosen.reason]
+    state.q[rows] = new
+    for i in np.flatnonzero(~moved):
+        state.reason[rows[i]] = reasons[i]
+    return moved
+
+
+def _search_on(
+    kernel: Kernel, chain: Chain, state: _State, every: PoseInputs, target: Array, near: Array,
+    options: CompensationSettings,
+) -> None:
+    """Rows that the correction did not solve, on the real model itself: damped least squares within the limits.
+
+    Near a singularity or the edge of the workspace F* may be out of the nominal robot's reach and F yet within the
+    real one's.
+    """
+    with np.errstate(invalid="ignore"):
+        solved = _size(chain, state.remaining) <= options.tolerance
+    rows = np.flatnonzero(~(solved & np.all(np.isfinite(state.q), axis=1)))
+    if not len(rows):
+        return
+    poses = every.subset(rows)
+    known = np.isfinite(state.q[rows])
+    start = np.where(known, state.q[rows], poses.q)
+
+    def at(q: Array, which: Rows) -> tuple[Array, Array]:
+        moved = poses.subset(which).with_q(q)
+        return kernel.frames(kernel.theta0, moved), kernel.joint_jacobian(kernel.theta0, moved)
+
+    settings = NumericSettings(tolerance=options.tolerance)
+    q, _ = refine(chain, target[rows], start, settings, within_limits=True, evaluate=at)
+    twist = _twist(kernel, poses.with_q(q), target[rows])
+    reached = settings.reached(chain, 0.1 * twist) if chain.n_joints >= 6 else settings.reached(chain, twist)
+    had = np.all(known, axis=1)
+    with np.errstate(invalid="ignore"):
+        better = reached | (had & (_size(chain, twist) < _size(chain, state.remaining[rows])))
+    for k in np.flatnonzero(better):
+        state.q[rows[k]], state.remaining[rows[k]] = q[k], twist[k]
+        state.reason[rows[k]] = None
