@@ -1,0 +1,121 @@
+"""Where the measured centre of a circular target lies: not in the image of the circle's centre.
+
+Two effects, both exact to second order of the dot's image size:
+
+- perspective: the centre of the projected ellipse is the pole of the line at infinity with respect to the dual conic
+  (Hartley and Zisserman, Multiple View Geometry, 2nd ed., 8.3), see :mod:`robcal.photogrammetry.eccentric_circle`;
+- distortion changes across the dot: the area centroid of an ellipse with second moments ``S`` under a smooth map ``g``
+  with Jacobian ``G`` and second derivatives ``H`` is ``g + H:S/2 + G S grad(ln det G)``. A least-squares ellipse
+  through the contour has the same centre to this order.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from robcal.photogrammetry.camera import Camera, project, project_with_jacobians
+from robcal.photogrammetry.eccentric_circle import effective_point
+from robcal.transforms import Array
+
+_STEP = 1e-4
+"""Half the interval of the central differences over ideal image coordinates (radians, so about 0.2 px)."""
+
+
+def centre_shift(camera: Camera, p_camera: ArrayLike, normal_camera: ArrayLike, radius: ArrayLike) -> Array:
+    """Offset (m, 2) in px of the measured centre from the image of the circle's centre.
+
+    Parameters
+    ----------
+    p_camera : (m, 3) m, centres in the camera frame.
+    normal_camera : (m, 3) unit normals in the camera frame; sign irrelevant, NaN: no correction.
+    radius : (m,) m; zero or NaN: no correction.
+    """
+    p, n = np.asarray(p_camera, dtype=float), np.asarray(normal_camera, dtype=float)
+    r = np.asarray(radius, dtype=float)
+    out = np.zeros((len(p), 2))
+    rows = np.flatnonzero(np.isfinite(n).all(axis=1) & (np.nan_to_num(r) > 0) & (p[:, 2] > 0))
+    if len(rows) == 0 or camera.fx <= 0:
+        return out
+    p, n, r = p[rows], n[rows], r[rows]
+    effective = effective_point(p, n, r)
+    centre = effective[:, :2] / effective[:, 2:]
+    # semi-axes matrix of the ideal ellipse from the dual conic C*: S = m m' - C*[:2, :2] / C*[2, 2]
+    dual = p[:, :2, None] * p[:, None, :2] - (r**2)[:, None, None] * (np.eye(2) - n[:, :2, None] * n[:, None, :2])
+    last = p[:, 2] ** 2 - r**2 * (1.0 - n[:, 2] ** 2)
+    shape = centre[:, :, None] * centre[:, None, :] - dual / last[:, None, None]
+    moments = 0.25 * shape
+    jacobian = _ideal_jacobian(camera, centre)
+    second = np.empty((len(p), 2, 2, 2))  # [..., i, j, k]: derivative of G_ij by coordinate k
+    for k in range(2):
+        step = np.zeros(2)
+        step[k] = _STEP
+        ahead, behind = _ideal_jacobian(camera, centre + step), _ideal_jacobian(camera, centre - step)
+        second[..., k] = (ahead - behind) / (2.0 * _STEP)
+    # grad ln det G = trace(G^-1 dG/du_k)
+    log_slope = np.einsum("mji,mijk->mk", np.linalg.inv(jacobian), second)
+    curvature = 0.5 * np.einsum("mijk,mjk->mi", second, moments)
+    curvature += np.einsum("mij,mjk,mk->mi", jacobian, moments, log_slope)
+    shift = project(camera, effective) - project(camera, p) + curvature
+    out[rows] = np.where(np.isfinite(shift), shift, 0.0)
+    return out
+
+
+def _ideal_jacobian(camera: Camera, ideal: Array) -> Array:
+    """Derivatives (m, 2, 2) of pixels by ideal image coordinates (m, 2)."""
+    ray = np.concatenate([ideal, np.ones_like(ideal[:, :1])], axis=1)
+    return project_with_jacobians(camera, ray)[1][:, :, :2]
+
+
+def body_normals(points: ArrayLike, neighbours: int = 6) -> Array:
+    """Unit normals (t, 3) of targets on a body from the body's own shape; sign: away from the centroid where curved.
+
+    A plane gets its normal, a sphere radial ones, any other smooth body those of planes through the nearest
+    neighbours. NaN where the neighbourhood is no plane (thicker than a quarter of its width).
+
+    Weakness: targets on small facets with few neighbours get NaN; then no eccentricity is modelled for them.
+    """
+    p = np.asarray(points, dtype=float)
+    t = len(p)
+    normals = np.full((t, 3), np.nan)
+    if t < 4:
+        if t == 3:
+            normal = np.cross(p[1] - p[0], p[2] - p[0])
+            length = np.linalg.norm(normal)
+            if length > 0:
+                normals[:] = normal / length
+        return normals
+    centred = p - p.mean(axis=0)
+    _, values, axes = np.linalg.svd(centred, full_matrices=False)
+    if values[2] < 0.02 * values[1]:
+        normals[:] = axes[2]
+        return normals
+    if t >= 8:
+        centre, radius, misfit = fit_sphere(p)
+        if misfit < 0.02 * radius:
+            return (p - centre) / np.linalg.norm(p - centre, axis=1, keepdims=True)
+    count = min(neighbours, t - 1)
+    distance = np.linalg.norm(p[:, None] - p[None], axis=2)
+    nearest = np.argsort(distance, axis=1)[:, : count + 1]
+    local = p[nearest] - p[nearest].mean(axis=1, keepdims=True)
+    _, values, axes = np.linalg.svd(local, full_matrices=False)
+    flat = values[:, 2] < 0.25 * values[:, 1]
+    normals[flat] = axes[flat, 2]
+    outward = np.einsum("ti,ti->t", normals, centred) < 0
+    normals[outward] *= -1.0
+    return normals
+
+
+def fit_sphere(points: ArrayLike) -> tuple[Array, float, float]:
+    """Centre (3,), radius and RMS distance of points (n, 3) from the algebraic best sphere (n >= 4).
+
+    Weakness: flat point sets give a huge sphere; test for a plane first.
+    """
+    p = np.asarray(points, dtype=float)
+    mean = p.mean(axis=0)
+    centred = p - mean
+    design = np.column_stack([2.0 * centred, np.ones(len(p))])
+    solution = np.linalg.lstsq(design, np.sum(centred**2, axis=1), rcond=None)[0]
+    radius = float(np.sqrt(max(solution[3] + solution[:3] @ solution[:3], 0.0)))
+    misfit = np.linalg.norm(centred - solution[:3], axis=1) - radius
+    return mean + solution[:3], radius, float(np.sqrt(np.mean(misfit**2)))
