@@ -68,6 +68,17 @@ class Family:
     frees: tuple[str, ...] = ()
     displace: Callable[[ObservationData, Constants], Array] | None = None
     covariates: tuple[str, ...] = ()
+    default_prior: float = 1.5e-4
+
+    def names(self, constants: Constants) -> tuple[str, ...]:
+        """Amplitudes in column order; where their number depends on the constants they are read from the bases."""
+        if self.parameters or self.bases is None:
+            return self.parameters
+        return tuple(dict.fromkeys(basis.parameter for basis in self.bases(constants)))
+
+    def sizes(self, constants: Constants) -> Array:
+        """Typical amplitude of each column."""
+        return np.array(self.priors) if self.priors else np.full(len(self.names(constants)), self.default_prior)
 
     @property
     def key(self) -> tuple[str, str, str | None]:

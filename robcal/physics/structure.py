@@ -9,6 +9,7 @@ import numpy as np
 
 from robcal.physics.family import DEG, PER_KNM, Basis, Constants, Family
 from robcal.physics.site import LETTER_OF_KIND, Joint, RobotSite, exponential_law
+from robcal.robot.terms import identifier
 from robcal.transforms import Array
 
 
@@ -26,13 +27,13 @@ def structure_families(site: RobotSite) -> Iterator[Family]:
 def _link_compliance(site: RobotSite, joint: Joint) -> Iterator[Family]:
     for angle in joint.cross_angles if not joint.prismatic else ("roll", "pitch", "yaw"):
         name = f"{joint.frame}.elastic_{angle}"
-        if name in site.fitted or name in site.tied or not site.varies(f"{joint.frame}_m{angle}", 1.0):
+        if name in site.fitted or name in site.tied or not site.varies(f"{identifier(joint.frame)}_m{angle}", 1.0):
             continue
         yield Family(
             "link_compliance", "robot", joint.where, LETTER_OF_KIND[angle], (name,), (1e-6,),
             lambda v, c: {"compliance_deg_per_kNm": float(v[0]) * PER_KNM},
             "The link or bearing of {where} gives way about {direction} by {compliance_deg_per_kNm:.3g} deg/kNm",
-            frees=(name,), covariates=(f"{joint.frame}_m{angle}",),
+            frees=(name,), covariates=(f"{identifier(joint.frame)}_m{angle}",),
         )
 
 

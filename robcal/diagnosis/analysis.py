@@ -1,0 +1,116 @@
+"""One look at one fit: all candidates tested, ranked, and the family-wise probability of the largest."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from robcal.diagnosis.blunders import Suspect, worst_group
+from robcal.diagnosis.candidates import Tangents, entries, tangents
+from robcal.diagnosis.empirical import empirical_families
+from robcal.diagnosis.family_wise import FamilyWise, simulate
+from robcal.diagnosis.naming import Posterior, posterior
+from robcal.diagnosis.recording import Accepted, Fit, Recording
+from robcal.diagnosis.scan import Entry, ScanResult, Stack, orthonormal_basis, scan, stack_entries
+from robcal.physics.family import Constants, Family
+from robcal.physics.library import all_families
+from robcal.physics.site import RobotSite
+from robcal.transforms import Array
+
+
+@dataclass(frozen=True)
+class Analysis:
+    """Everything known at one fit.
+
+    Attributes
+    ----------
+    families : named ones and empirical ones; `named` (f,) tells which.
+    basis : (m, p) orthonormal basis of the fitted Jacobian. residual : (m,) projected.
+    stacks, result, ranked : the scan. family_wise : its level. p_value : of the largest mismatch.
+    """
+
+    fit: Fit
+    at: Tangents
+    families: tuple[Family, ...]
+    named: Array
+    entries: tuple[Entry, ...]
+    basis: Array
+    residual: Array
+    stacks: tuple[Stack, ...]
+    result: ScanResult
+    ranked: Posterior
+    family_wise: FamilyWise
+    p_value: float
+    suspect: Suspect
+
+    def top(self, chosen: Array) -> int:
+        """Most probable family among the chosen ones."""
+        return int(np.argmax(np.where(chosen, self.ranked.log_weight, -np.inf)))
+
+    def constants(self, family: int) -> Constants:
+        """Best grid point of a family."""
+        return self.families[family].grid[int(self.ranked.best_grid[family])]
+
+
+def library_at(fit: Fit, recording: Recording, at: Tangents, tied: frozenset[str]) -> tuple[Family, ...]:
+    """Families that may act here and are not in the model already."""
+    site = RobotSite(fit.model, at.variables, frozenset(fit.free), tied)
+    present = {(a.family.key, tuple(sorted(a.constants.items()))) for a in fit.accepted}
+    single = {a.family.key for a in fit.accepted if len(a.family.grid) == 1 or a.family.continuous}
+    named = [f for f in all_families(site, at.data, recording.ids, recording.body) if f.key not in single]
+    empirical = list(empirical_families(site)) if recording.observations_are_spatial else []
+    return tuple(f for f in (*named, *empirical) if (f.key, tuple(sorted(f.grid[0].items()))) not in present)
+
+
+def analyse(
+    fit: Fit, recording: Recording, tied: frozenset[str], *, runs: int = 400, level: FamilyWise | None = None,
+) -> Analysis:
+    """Scan all candidates at a fit; `level` reuses a simulated family-wise level of the same design."""
+    at = tangents(fit, recording)
+    families = library_at(fit, recording, at, tied)
+    listed = tuple(entries(families, at))
+    basis = orthonormal_basis(fit.jacobian)
+    return _look(fit, at, families, listed, basis, runs, level, recording)
+
+
+def extend(analysis: Analysis, columns: Array) -> Analysis:
+    """The same look with further columns (m, c) fitted, to first order: what would be left after adding a cause."""
+    projected = columns - analysis.basis @ (analysis.basis.T @ columns)
+    basis = np.concatenate([analysis.basis, orthonormal_basis(projected)], axis=1)
+    return _look(
+        analysis.fit, analysis.at, analysis.families, analysis.entries, basis, 0, analysis.family_wise,
+        analysis.at.recording,
+    )
+
+
+def _look(
+    fit: Fit, at: Tangents, families: Sequence[Family], listed: Sequence[Entry], basis: Array, runs: int,
+    level: FamilyWise | None, recording: Recording,
+) -> Analysis:
+    residual = fit.residual - basis @ (basis.T @ fit.residual)
+    redundancy = len(residual) - basis.shape[1]
+    stacks = stack_entries(listed, basis)
+    result = scan(stacks, residual, redundancy)
+    ranked = posterior(families, result)
+    family_wise = level if level is not None else simulate(stacks, basis, redundancy, runs=runs)
+    p_value = family_wise.probability(float(result.log_p[result.best]))
+    named = np.array([family.cause != "unknown" for family in families])
+    suspect = worst_group(residual, basis, recording.row_groups(len(residual)))
+    return Analysis(
+        fit, at, tuple(families), named, tuple(listed), basis, residual, stacks, result, ranked, family_wise, p_value,
+        suspect,
+    )
+
+
+def accepted_from(analysis: Analysis, family: int, constants: Constants) -> Accepted:
+    """A family to be added, with start values from the linear problem."""
+    chosen = analysis.families[family]
+    sizes = chosen.sizes(constants)
+    columns = analysis.at.columns(chosen, constants) * sizes
+    projected = columns - analysis.basis @ (analysis.basis.T @ columns)
+    gram = projected.T @ projected + np.eye(len(sizes)) * 1e-2
+    values = np.linalg.solve(gram, projected.T @ analysis.residual) * sizes
+    start = 0.0 * values if chosen.frees else values
+    return Accepted(chosen, constants, start, np.zeros((len(values), len(values))))

@@ -1,0 +1,118 @@
+"""Empirical terms for what the library has no name for: smooth bumps, harmonics and products in covariates.
+
+Each is a family like the named causes, with the cause `unknown`, and competes with them by evidence. Its parameters
+are the coefficients of radial bumps over the covariate; their common prior makes it a coarse Gaussian process.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from robcal.physics.family import Basis, Constants, Family
+from robcal.physics.site import LETTER_OF_KIND, Joint, RobotSite
+from robcal.transforms import Array
+
+BUMPS = (4, 7, 12)
+"""Numbers of bumps over the range of a covariate: three lengths over which it may vary."""
+EMPIRICAL_WEIGHT = 0.2
+"""Prior weight of all empirical families together, against one for each named cause."""
+
+
+def empirical_families(site: RobotSite) -> Iterator[Family]:
+    """Smooth laws in the joint's own angle, other angles, its torque, time, temperature and order; and products."""
+    families: list[Family] = []
+    joints = [joint for joint in site.joints if site.varies(f"q{joint.number}", 1e-6)]
+    for joint in joints:
+        kinds = ("q", *joint.cross_angles) if not joint.prismatic else ("q",)
+        for kind in kinds:
+            own = [f"q{joint.number}", f"torque{joint.number}"]
+            others = [f"q{other.number}" for other in joints if other.number != joint.number]
+            covariates = own + (others if kind == "q" else []) + ["index"] * (kind == "q")
+            covariates += ["time_s"] * (kind == "q") + list(site.temperatures() if kind == "q" else ())
+            for covariate in covariates:
+                if site.varies(covariate, 1e-6):
+                    families.append(_smooth(site, joint, kind, covariate))
+        families.extend(_product(joint, first, second) for i, first in enumerate(joints) for second in joints[i + 1:])
+        families.append(_bump(site, joint))
+    yield from (replace(family, weight=EMPIRICAL_WEIGHT / len(families)) for family in families)
+
+
+def _place(joint: Joint, kind: str) -> str:
+    return LETTER_OF_KIND[joint.own_angle if kind == "q" else kind]
+
+
+def _term(variables: list[str], kind: str, formula: str) -> dict[str, object]:
+    shown = [f"{v}_deg" if v[0] == "q" and v[1:].isdigit() else v for v in variables]
+    return {"variables": shown, "kind": kind, "formula": formula}
+
+
+def _formula(bases: tuple[Basis, ...], values: Array) -> str:
+    return " + ".join(f"{value:.6g}*({b.expression})" for b, value in zip(bases, values, strict=True))
+
+
+def _smooth(site: RobotSite, joint: Joint, kind: str, covariate: str) -> Family:
+    values = site.variables[covariate]
+    low, high = float(np.min(values)), float(np.max(values))
+
+    def bases(c: Constants) -> tuple[Basis, ...]:
+        count = int(c["bumps"])
+        centres = np.linspace(low, high, count)
+        width = (high - low) / (count - 1)
+        return tuple(
+            Basis(joint.frame, kind, f"exp(-0.5*(({covariate} - {float(x)!r})/{width!r})**2)", f"c{i}")
+            for i, x in enumerate(centres)
+        )
+
+    def report(v: Array, c: Constants) -> dict[str, object]:
+        return {"term": _term([covariate], "gaussian_process", _formula(bases(c), v))}
+
+    # number of parameters changes with the grid, so each number of bumps is a grid point of its own width
+    return Family(
+        "unknown", "robot", joint.where, _place(joint, kind), (), (), report,
+        "Something the library has no name for acts on {where} and follows " + covariate,
+        grid=tuple({"bumps": float(n)} for n in BUMPS), bases=bases, covariates=(covariate,),
+    )
+
+
+def _product(joint: Joint, first: Joint, second: Joint) -> Family:
+    a, b = f"q{first.number}", f"q{second.number}"
+
+    def bases(c: Constants) -> tuple[Basis, ...]:
+        n, m = c["first_order"], c["second_order"]
+        laws = [f"{f}({n!r}*{a})*{g}({m!r}*{b})" for f in ("cos", "sin") for g in ("cos", "sin")]
+        if n == m == 1.0:
+            laws.append(f"{a}*{b}")
+        return tuple(Basis(joint.frame, "q", law, f"c{i}") for i, law in enumerate(laws))
+
+    return Family(
+        "unknown", "robot", joint.where, _place(joint, "q"), (), (),
+        lambda v, c: {"term": _term([a, b], "harmonic", _formula(bases(c), v))},
+        f"Something the library has no name for acts on {{where}} and follows {a} together with {b}",
+        grid=tuple({"first_order": n, "second_order": m} for n in (1.0, 2.0) for m in (1.0, 2.0)),
+        bases=bases, covariates=(a, b),
+    )
+
+
+def _bump(site: RobotSite, joint: Joint) -> Family:
+    k = joint.number
+    values = site.variables[f"q{k}"]
+    low, high = float(np.min(values)), float(np.max(values))
+    widths = [share * (high - low) for share in (0.01, 0.025, 0.05)]
+    grid = tuple(
+        {"centre": float(x), "width": w} for w in widths for x in np.arange(low, high + w, w) if w > 1e-6
+    )
+
+    def bases(c: Constants) -> tuple[Basis, ...]:
+        return (Basis(joint.frame, "q", f"exp(-0.5*((q{k} - {c['centre']!r})/{c['width']!r})**2)", "c0"),)
+
+    return Family(
+        "unknown", "robot", joint.where, _place(joint, "q"), (), (),
+        lambda v, c: {"term": _term([f"q{k}"], "formula", _formula(bases(c), v))},
+        "{where} is disturbed around one angle only (a damaged tooth, a dent)",
+        grid=grid, continuous={"centre": (low, high), "width": (0.003 * (high - low), 0.2 * (high - low))},
+        bases=bases, covariates=(f"q{k}",),
+    )
+

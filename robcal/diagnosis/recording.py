@@ -1,0 +1,285 @@
+"""What a diagnosis works on: a robot, poses, observations; and one linearised fit of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from robcal.calibration.observations import (
+    DistanceObservations,
+    FrameObservations,
+    Observations,
+    PointObservations,
+    SensorPointObservations,
+)
+from robcal.diagnosis.decorrelation import SharedNoise
+from robcal.errors import InvalidInput
+from robcal.physics.family import Constants, Family, ObservationData
+from robcal.robot.kernel import Kernel, PoseInputs
+from robcal.robot.model import RobotModel, Term
+from robcal.transforms import Array, transform
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Recorded poses and what was measured in them.
+
+    Attributes
+    ----------
+    q : (n, joints) in the sense of q, rad or m.
+    payload : name of the payload of each pose, or None.
+    covariates : per pose, (n,) each: index, approachK, time_s, temp_*_c ...
+    names : of the poses.
+    observations : one kind of measurement; `pose` in it counts rows of q.
+    body : name of the measuring body; ids : its targets.
+    """
+
+    q: Array
+    payload: tuple[str | None, ...]
+    covariates: Mapping[str, Array]
+    names: tuple[str, ...]
+    observations: Observations
+    body: str = "body"
+    ids: tuple[int, ...] = ()
+    shared: SharedNoise | None = None
+
+    def linearise(self, frames: Array, J: Array) -> tuple[Array, Array]:
+        """Whitened residuals (m,) and Jacobian (m, p) at modelled frames (n, 4, 4) with right twists (n, 6, p)."""
+        residual, jacobian = self.observations.linearise(frames, J)
+        if self.shared is None:
+            return residual, jacobian
+        return self.shared.whiten(residual), self.shared.whiten(jacobian)
+
+    def whiten(self, displacement: Array) -> Array:
+        """Whitened rows (m, p) of displacements (m_obs, k, p) of the observations."""
+        rows = self.observations.whiten(displacement)
+        return rows if self.shared is None else self.shared.whiten(rows)
+
+    def unwhiten(self, rows: Array) -> Array:
+        """Displacements (m_obs, k, p) of whitened rows (m, p); inverse of :meth:`whiten`."""
+        return self.observations.unwhiten(rows if self.shared is None else self.shared.unwhiten(rows))
+
+    def pose_name(self, index: float) -> str:
+        """Name of the pose with a value of the covariate `index`."""
+        nearest = int(np.argmin(np.abs(self.covariates["index"] - index)))
+        return self.names[nearest]
+
+    def inputs(self, kernel: Kernel) -> PoseInputs:
+        """The poses as the kernel wants them."""
+        return kernel.poses(self.q, payload=self.payload, covariates=self.covariates)
+
+    @property
+    def observations_are_spatial(self) -> bool:
+        """Whether the observations tell directions (frames and points do, distances do not)."""
+        return not isinstance(self.observations, DistanceObservations)
+
+    def row_groups(self, rows: int) -> Array:
+        """Label of the observation to which each row of the residuals belongs."""
+        return np.repeat(np.arange(len(self.observations.pose)), rows // len(self.observations.pose))
+
+    def without_observations(self, drop: Array) -> Recording:
+        """Without the observations of the given indices."""
+        keep = np.setdiff1d(np.arange(len(self.observations.pose)), drop)
+        shared = None if self.shared is None else self.shared.subset(keep)
+        return replace(self, observations=self.observations.subset(keep), shared=shared)
+
+    def subset(self, keep: Array) -> Recording:
+        """Only the poses where `keep` (n,) is true; observations of the others are left out."""
+        rows = np.flatnonzero(keep)
+        number = np.full(len(self.q), -1)
+        number[rows] = np.arange(len(rows))
+        chosen = np.flatnonzero(keep[self.observations.pose])
+        observations = self.observations.subset(chosen)
+        observations = replace(observations, pose=number[observations.pose])
+        return replace(
+            self, q=self.q[rows], payload=tuple(self.payload[i] for i in rows), names=tuple(self.names[i] for i in rows),
+            covariates={name: np.asarray(values)[rows] for name, values in self.covariates.items()},
+            observations=observations, shared=None,
+        )
+
+
+@dataclass(frozen=True)
+class Accepted:
+    """A family with constants that is part of the model, and its amplitudes (SI)."""
+
+    family: Family
+    constants: Constants
+    values: Array
+    covariance: Array
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Short names of the amplitudes."""
+        return self.family.names(self.constants)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A model fitted to a recording, linearised where it ended.
+
+    Attributes
+    ----------
+    model : robot with parameters and terms filled. kernel : of that model. theta : (P,) all its parameters.
+    free : names of the fitted parameters, in the order of the first columns of `jacobian`.
+    accepted : causes in the model, their amplitudes and covariances.
+    residual : (m,) whitened, measured - model. jacobian : (m, p) whitened.
+    row_pose : (m,) pose of each row. inputs, frames : poses and modelled frames of the tool.
+    covariance : (p, p) of the free parameters and the amplitudes of observation causes, variance factor one.
+    """
+
+    model: RobotModel
+    kernel: Kernel
+    theta: Array
+    free: tuple[str, ...]
+    accepted: tuple[Accepted, ...]
+    residual: Array
+    jacobian: Array
+    row_pose: Array
+    inputs: PoseInputs
+    frames: Array
+    covariance: Array
+
+    @property
+    def redundancy(self) -> int:
+        """Observations less parameters."""
+        return int(len(self.residual) - np.linalg.matrix_rank(self.jacobian / np.linalg.norm(self.jacobian, axis=0)))
+
+    @property
+    def variance_factor(self) -> float:
+        """Mean square of the whitened residuals per degree of freedom."""
+        return float(self.residual @ self.residual) / max(self.redundancy, 1)
+
+
+def observation_data(recording: Recording, frames: Array, variables: Mapping[str, Array]) -> ObservationData:
+    """What observation families need, at the modelled frames (n, 4, 4)."""
+    obs = recording.observations
+    m = len(obs.pose)
+    T = frames[obs.pose]
+    if isinstance(obs, PointObservations):
+        return ObservationData(
+            "points", obs.pose, np.asarray(obs.target), T, obs.p_tool, transform(T, obs.p_tool), None, variables
+        )
+    if isinstance(obs, FrameObservations):
+        none = np.full(m, -1)
+        return ObservationData("frames", obs.pose, none, T, np.zeros((m, 3)), T[:, :3, 3], None, variables)
+    if isinstance(obs, DistanceObservations):
+        none = np.full(m, -1)
+        return ObservationData("distances", obs.pose, none, T, np.zeros((m, 3)), T[:, :3, 3], None, variables)
+    if isinstance(obs, SensorPointObservations):
+        none = np.full(m, -1)
+        return ObservationData(
+            "sensor", obs.pose, none, T, obs.p_sensor, transform(T, obs.p_sensor), obs.p_sensor, variables
+        )
+    raise InvalidInput(f"observations of type {type(obs).__name__} cannot be diagnosed")
+
+
+def terms_of(accepted: Accepted, number: int) -> tuple[Term, ...]:
+    """Terms of the kernel for an accepted robot cause; amplitudes as its parameters."""
+    family = accepted.family
+    if family.bases is None:
+        return ()
+    name = f"{family.where}_{family.cause}_{number}"
+    values = dict(zip(accepted.names, map(float, accepted.values), strict=True))
+    groups: dict[tuple[str, str], list[tuple[str, str]]] = {}
+    for basis in family.bases(accepted.constants):
+        groups.setdefault((basis.frame, basis.kind), []).append((basis.parameter, basis.expression))
+    return tuple(
+        Term(
+            name, frame, kind, " + ".join(f"{p}*({expression})" for p, expression in parts),
+            {p: values[p] for p, _ in parts}, cause=family.cause,
+        )
+        for (frame, kind), parts in groups.items()
+    )
+
+
+def fit(
+    model: RobotModel, recording: Recording, free: Sequence[str], accepted: Sequence[Accepted] = (),
+    *, iterations: int = 8, statics: str = "one_step",
+) -> Fit:
+    """Least squares of the free parameters and all accepted causes together, from the model's present values.
+
+    Robot causes become terms of the kernel; observation causes stay linear displacements of what was measured.
+    """
+    for number, item in enumerate(accepted):
+        model = model.with_terms(terms_of(item, number))
+    kernel = Kernel(model)
+    inputs = recording.inputs(kernel)
+    names = list(dict.fromkeys([*free, *(n for a in accepted for n in a.family.frees)]))
+    names += [full for term in model.terms for full in term.parameter_names if full not in names]
+    position = {name: i for i, name in enumerate(kernel.names)}
+    columns = np.array([position[name] for name in names])
+    theta = np.array(kernel.theta0, dtype=float)
+    direct = [item for item in accepted if item.family.displace is not None]
+    obs = recording.observations
+    rows = len(obs.pose)
+    previous = np.inf
+    for _ in range(iterations):
+        frames, J = kernel.frames_and_jacobian(theta, inputs, columns=columns)
+        residual, jacobian = recording.linearise(frames, J)
+        if direct:
+            data = observation_data(recording, frames, kernel.variables(theta, inputs))
+            extra = [recording.whiten(item.family.displace(data, item.constants)) for item in direct]  # type: ignore[misc]
+            jacobian = np.concatenate([jacobian, *extra], axis=1)
+        step, size = solve(jacobian, residual)
+        theta[columns] += step[: len(columns)]
+        change = float(np.sum((jacobian[:, : len(columns)] @ step[: len(columns)]) ** 2))
+        if change < 1e-10 or abs(previous - change) < 1e-14:
+            break
+        previous = change
+    frames, J = kernel.frames_and_jacobian(theta, inputs, columns=columns)
+    residual, jacobian = recording.linearise(frames, J)
+    if direct:
+        data = observation_data(recording, frames, kernel.variables(theta, inputs))
+        extra = [recording.whiten(item.family.displace(data, item.constants)) for item in direct]  # type: ignore[misc]
+        jacobian = np.concatenate([jacobian, *extra], axis=1)
+    step, size = solve(jacobian, residual)
+    step[: len(columns)] = 0.0 if not direct else step[: len(columns)]
+    residual = residual - jacobian @ step
+    covariance = pseudo_covariance(jacobian)
+    filled = model.with_parameters({name: float(theta[position[name]]) for name in names})
+    done = _amplitudes(accepted, direct, names, position, theta, step[len(columns):], covariance, len(columns))
+    return Fit(
+        filled, kernel, theta, tuple(names), done, residual, jacobian, np.repeat(obs.pose, len(residual) // rows),
+        inputs, frames, covariance,
+    )
+
+
+def _amplitudes(
+    accepted: Sequence[Accepted], direct: Sequence[Accepted], names: Sequence[str], position: Mapping[str, int],
+    theta: Array, linear: Array, covariance: Array, first_direct: int,
+) -> tuple[Accepted, ...]:
+    done = []
+    offset = 0
+    for number, item in enumerate(accepted):
+        width = len(item.names)
+        if item.family.displace is not None:
+            where = np.arange(first_direct + offset, first_direct + offset + width)
+            values = linear[offset: offset + width]
+            offset += width
+        else:
+            full = item.family.frees or tuple(
+                f"{item.family.where}_{item.family.cause}_{number}.{short}" for short in item.names
+            )
+            where = np.array([names.index(name) for name in full])
+            values = np.array([theta[position[name]] for name in full])
+        done.append(replace(item, values=values, covariance=covariance[np.ix_(where, where)]))
+    return tuple(done)
+
+
+def solve(jacobian: Array, residual: Array) -> tuple[Array, Array]:
+    """Minimum-norm least-squares step, columns scaled to unit length first; also the column lengths."""
+    size = np.linalg.norm(jacobian, axis=0)
+    safe = np.where(size > 0, size, 1.0)
+    step = np.linalg.lstsq(jacobian / safe, residual, rcond=1e-10)[0]
+    return step / safe, size
+
+
+def pseudo_covariance(jacobian: Array) -> Array:
+    """Pseudo-inverse of the normal matrix, columns scaled; directions without information get no variance."""
+    size = np.linalg.norm(jacobian, axis=0)
+    safe = np.where(size > 0, size, 1.0)
+    scaled = jacobian / safe
+    inverse = np.linalg.pinv(scaled.T @ scaled, rcond=1e-18, hermitian=True)
+    return inverse / np.outer(safe, safe)

@@ -1,0 +1,164 @@
+"""The scan: every candidate's tangent columns, projected out of the fitted Jacobian, tested against the residuals.
+
+All quantities are whitened. With `Q` an orthonormal basis of the fitted Jacobian, a candidate with columns `C` (scaled
+by the prior amplitudes) is seen through `C - Q Q' C = U S V'`; its test statistic is `|U' r|^2` (an F test with the
+estimated variance factor), its evidence against "nothing is missing" is the Bayes factor of a linear Gaussian model
+whose amplitudes have the prior as standard deviation, averaged over three sizes of prior. Source: Kass and Raftery
+(1995) for Bayes factors; Baarda (1968), Teunissen (2006) for detection, identification, adaptation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from robcal.transforms import Array
+
+PRIOR_SCALES = (0.3, 1.0, 3.0)
+"""Sizes of the prior amplitude over which the evidence is averaged."""
+LEAST_SIGNAL = 0.05
+"""Directions whose signal stays below this many sigma at the typical amplitude cannot be seen and are left out."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One candidate with fixed constants: index of its family, of its grid point, and its whitened columns (m, c)."""
+
+    family: int
+    grid: int
+    columns: Array
+
+
+@dataclass(frozen=True)
+class Stack:
+    """All entries with the same number of columns, orthonormalised after projection.
+
+    Attributes
+    ----------
+    family, grid : (e,) indices.
+    basis : (e, m, c) orthonormal columns U (zero where a direction cannot be seen).
+    singular : (e, c) projected signal per prior amplitude, in sigma.
+    right : (e, c, c) V'.
+    count : (e,) directions that can be seen.
+    """
+
+    family: Array
+    grid: Array
+    basis: Array
+    singular: Array
+    right: Array
+    count: Array
+
+
+@dataclass(frozen=True)
+class ScanResult:
+    """Statistics of all entries, concatenated over the stacks.
+
+    Attributes
+    ----------
+    family, grid : (e,) indices. count : (e,) degrees of freedom.
+    chi2 : (e,) squared norm of the projected residual, divided by the variance factor.
+    log_p : (e,) natural logarithm of the single-test F probability.
+    log_evidence : (e,) logarithm of the Bayes factor against no cause.
+    variance_factor : residual variance without the best entry.
+    redundancy : degrees of freedom of the residuals.
+    """
+
+    family: Array
+    grid: Array
+    count: Array
+    chi2: Array
+    log_p: Array
+    log_evidence: Array
+    variance_factor: float
+    redundancy: int
+
+    @property
+    def best(self) -> int:
+        """Entry with the smallest single-test probability."""
+        return int(np.argmin(self.log_p))
+
+
+def orthonormal_basis(jacobian: Array) -> Array:
+    """Orthonormal columns that span a (possibly rank-deficient) Jacobian (m, p)."""
+    size = np.linalg.norm(jacobian, axis=0)
+    scaled = jacobian[:, size > 0] / size[size > 0]
+    U, s, _ = np.linalg.svd(scaled, full_matrices=False)
+    return U[:, s > 1e-9 * s[0]] if len(s) else U
+
+
+def stack_entries(entries: Sequence[Entry], fitted: Array) -> tuple[Stack, ...]:
+    """Project all entries out of the fitted basis (m, p) and orthonormalise them, grouped by number of columns."""
+    stacks = []
+    for width in sorted({entry.columns.shape[1] for entry in entries}):
+        group = [entry for entry in entries if entry.columns.shape[1] == width]
+        columns = np.stack([entry.columns for entry in group])
+        m = columns.shape[1]
+        flat = columns.transpose(1, 0, 2).reshape(m, -1)
+        norms = np.linalg.norm(flat, axis=0)
+        flat = flat - fitted @ (fitted.T @ flat)
+        # a column that vanishes against its own size is rounding noise
+        flat[:, np.linalg.norm(flat, axis=0) < 1e-7 * norms] = 0.0
+        projected = np.ascontiguousarray(flat.reshape(m, len(group), width).transpose(1, 0, 2))
+        if width == 1:
+            singular = np.linalg.norm(projected, axis=1)
+            basis = projected / np.where(singular > 0, singular, 1.0)[:, None, :]
+            right = np.ones((len(group), 1, 1))
+        else:
+            gram = np.swapaxes(projected, 1, 2) @ projected
+            values, vectors = np.linalg.eigh(gram)
+            singular = np.sqrt(np.clip(values[:, ::-1], 0.0, None))
+            vectors = vectors[:, :, ::-1]
+            right = np.swapaxes(vectors, 1, 2)
+            basis = projected @ (vectors / np.where(singular > 0, singular, 1.0)[:, None, :])
+        seen = (singular > LEAST_SIGNAL) & (singular > 1e-5 * singular.max(axis=1, keepdims=True, initial=0.0))
+        basis = basis * seen[:, None, :]
+        stacks.append(
+            Stack(
+                np.array([entry.family for entry in group]), np.array([entry.grid for entry in group]),
+                basis, singular * seen, right, seen.sum(axis=1),
+            )
+        )
+    return tuple(stacks)
+
+
+def log_bayes_factor(singular: Array, z: Array) -> Array:
+    """Evidence of entries (e,) from singular values (e, c) in sigma per prior amplitude and scores z (e, c)."""
+    parts = []
+    for scale in PRIOR_SCALES:
+        gain = (scale * singular) ** 2
+        parts.append(np.sum(0.5 * z**2 * gain / (1.0 + gain) - 0.5 * np.log1p(gain), axis=1))
+    return np.asarray(np.logaddexp.reduce(parts, axis=0) - np.log(len(PRIOR_SCALES)))
+
+
+def scan(stacks: Sequence[Stack], residual: Array, redundancy: int) -> ScanResult:
+    """Test all entries against projected residuals (m,).
+
+    Weakness: one variance factor for all rows; rows must be whitened with covariances right up to that factor.
+    """
+    scores = [np.einsum("emc,m->ec", stack.basis, residual) for stack in stacks]
+    raw = np.concatenate([np.sum(z**2, axis=1) for z in scores])
+    family = np.concatenate([stack.family for stack in stacks])
+    grid = np.concatenate([stack.grid for stack in stacks])
+    count = np.concatenate([stack.count for stack in stacks])
+    total = float(residual @ residual)
+    log_p = log_f_probability(raw, count, total, redundancy)
+    best = int(np.argmin(log_p))
+    variance = (total - raw[best]) / max(redundancy - count[best], 1)
+    sigma = np.sqrt(max(variance, 1e-300))
+    evidence = np.concatenate(
+        [log_bayes_factor(stack.singular / sigma, z / sigma) for stack, z in zip(stacks, scores, strict=True)]
+    )
+    evidence[count == 0] = -np.inf
+    return ScanResult(family, grid, count, raw / variance, log_p, evidence, float(variance), redundancy)
+
+
+def log_f_probability(raw: Array, count: Array, total: Array | float, redundancy: int) -> Array:
+    """Natural logarithm of the F test's probability that `count` columns explain `raw` of the `total` square sum."""
+    left = np.maximum(redundancy - count, 1)
+    used = np.maximum(count, 1)
+    ratio = (raw / used) / (np.maximum(np.asarray(total) - raw, 1e-300) / left)
+    return np.asarray(np.where(count > 0, stats.f.logsf(ratio, used, left), 0.0))

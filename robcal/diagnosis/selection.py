@@ -1,0 +1,167 @@
+"""Detection, identification, adaptation, step by step: forward with re-projection and refit, then a backward check.
+
+A name is taken only if what it leaves behind is clean or is another named cause; where a smooth empirical term
+explains the same recording better than the best name and the best pair of names, the cause is `unknown`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from robcal.diagnosis.analysis import Analysis, accepted_from, analyse, extend
+from robcal.diagnosis.naming import refine
+from robcal.diagnosis.recording import Accepted, Fit, Recording, fit
+from robcal.physics.family import Constants
+from robcal.robot.model import RobotModel
+from robcal.transforms import Array
+
+
+@dataclass(frozen=True)
+class SelectionSettings:
+    """How the search runs.
+
+    Attributes
+    ----------
+    level : family-wise level of a mismatch.
+    most : causes at most.
+    blunder_log_p : logarithm of the probability (all observations weighed in) below which one is a gross error.
+    blunder_share : share of the observations that may be left out as gross errors.
+    runs : simulations for the family-wise level.
+    """
+
+    level: float = 0.01
+    most: int = 6
+    blunder_log_p: float = float(np.log(1e-3))
+    blunder_share: float = 0.1
+    runs: int = 400
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Outcome of the search.
+
+    Attributes
+    ----------
+    recording : without the observations that were left out.
+    accepted : causes in the order in which they were found.
+    p_values : family-wise, of the scan in which each was found.
+    first, last : looks at the first fit and at the last one.
+    blunders : observations left out: (index in the recording given, its pose's row).
+    """
+
+    recording: Recording
+    accepted: tuple[Accepted, ...]
+    p_values: tuple[float, ...]
+    first: Analysis
+    last: Analysis
+    blunders: tuple[tuple[int, int], ...]
+
+
+def select(
+    model: RobotModel, recording: Recording, free: tuple[str, ...], tied: frozenset[str],
+    settings: SelectionSettings = SelectionSettings(), tell: Callable[[str], None] = lambda text: None,
+) -> Selection:
+    """Search for what is missing in a fitted model."""
+    accepted: tuple[Accepted, ...] = ()
+    p_values: list[float] = []
+    left_out: list[tuple[int, int]] = []
+    number = np.arange(len(recording.observations.pose))
+    most_blunders = int(settings.blunder_share * len(number))
+    first: Analysis | None = None
+    while True:
+        present = fit(model, recording, free, accepted)
+        look = analyse(present, recording, tied, runs=settings.runs)
+        first = first or look
+        if _is_blunder(look, settings) and len(left_out) < most_blunders:
+            row = look.suspect.label
+            left_out.append((int(number[row]), int(recording.observations.pose[row])))
+            number = np.delete(number, row)
+            recording = recording.without_observations(np.array([row]))
+            first = None if not accepted else first
+            continue
+        if look.p_value > settings.level or len(accepted) >= settings.most:
+            break
+        family, constants = choose(look)
+        tell(f"{look.families[family].cause} at {look.families[family].where}: p {look.p_value:.2g}")
+        accepted = (*present.accepted, accepted_from(look, family, constants))
+        p_values.append(look.p_value)
+    if len(accepted) > 1:
+        accepted, p_values = _backward(model, recording, free, tied, present, p_values, settings)
+        present = fit(model, recording, free, accepted)
+        look = analyse(present, recording, tied, runs=settings.runs)
+    return Selection(recording, present.accepted, tuple(p_values), first, look, tuple(left_out))
+
+
+def _is_blunder(look: Analysis, settings: SelectionSettings) -> bool:
+    groups = len(look.at.recording.observations.pose)
+    significant = look.suspect.log_p + np.log(groups) < settings.blunder_log_p
+    return bool(significant and look.suspect.log_evidence > np.max(look.ranked.log_weight))
+
+
+def choose(look: Analysis) -> tuple[int, Constants]:
+    """The family to be added: best name or, where that explains less, the best empirical term."""
+    options: list[tuple[float, int, Constants]] = []
+    for chosen in (look.named, ~look.named):
+        if not np.any(chosen & np.isfinite(look.ranked.log_weight)):
+            continue
+        family = look.top(chosen)
+        constants = refine(look.families[family], look.constants(family), look.at, look.basis, look.residual)
+        weight = float(look.ranked.log_weight[family])
+        after = extend(look, look.at.columns(look.families[family], constants))
+        others = float(np.max(np.where(after.named, after.ranked.log_weight, -np.inf), initial=-np.inf))
+        options.append((weight + max(others, 0.0), family, constants))
+    _, family, constants = max(options, key=lambda option: option[0])
+    return family, constants
+
+
+def _backward(
+    model: RobotModel, recording: Recording, free: tuple[str, ...], tied: frozenset[str], present: Fit,
+    p_values: list[float], settings: SelectionSettings,
+) -> tuple[tuple[Accepted, ...], list[float]]:
+    """With all others in the model: is each cause still needed, and is its name still the best?"""
+    accepted = list(present.accepted)
+    probabilities = list(p_values)
+    k = 0
+    while k < len(accepted) and len(accepted) > 1:
+        others = tuple(accepted[:k] + accepted[k + 1:])
+        look = analyse(fit(model, recording, free, others), recording, tied, runs=settings.runs)
+        if look.p_value > settings.level:
+            accepted = list(look.fit.accepted)
+            del probabilities[k]
+            continue
+        family, constants = choose(look)
+        found = look.families[family]
+        if found.key != accepted[k].family.key and _gain(look, family, accepted[k]) > 3.0:
+            accepted = list(look.fit.accepted)
+            accepted.insert(k, accepted_from(look, family, constants))
+        k += 1
+    return tuple(accepted), probabilities
+
+
+def _gain(look: Analysis, family: int, present: Accepted) -> float:
+    """Logarithm of the posterior odds of a family against the one that stands."""
+    standing = [f for f, other in enumerate(look.families) if other.key == present.family.key]
+    weight = max((float(look.ranked.log_weight[f]) for f in standing), default=-np.inf)
+    return float(look.ranked.log_weight[family]) - weight
+
+
+def without(selection_fit: Fit, index: int) -> tuple[Accepted, ...]:
+    """All accepted causes but one."""
+    return tuple(item for k, item in enumerate(selection_fit.accepted) if k != index)
+
+
+def zeroed(item: Accepted) -> Accepted:
+    """The same cause with amplitudes zero (start of a refit)."""
+    return replace(item, values=np.zeros_like(item.values))
+
+
+def poses_that_carry(signature: Array, row_pose: Array, names: tuple[str, ...], most: int = 20) -> tuple[str, ...]:
+    """Poses that carry half of a projected signature's square sum, strongest first."""
+    power = np.bincount(row_pose, weights=signature**2, minlength=len(names))
+    order = np.argsort(-power)
+    share = np.cumsum(power[order]) / max(power.sum(), 1e-300)
+    count = min(int(np.searchsorted(share, 0.5)) + 1, most)
+    return tuple(names[i] for i in order[:count])
