@@ -91,8 +91,8 @@ def read_body(path: Path | str) -> BodyFile:
             raise InvalidInput(
                 f"{where}: unknown code '{target.code}': use ring12, corner, aruco:<dictionary> or null (no code)"
             )
-        if target.code == "ring12":
-            _check_ring12(target.id, where)
+        if target.code == "ring12" and target.id is None:
+            raise InvalidInput(f"{where}: a ring12 target needs its id (the number that its ring shows)")
         if target.xyz_mm is not None:
             if target.xyz_mm in places:
                 raise InvalidInput(
@@ -123,16 +123,24 @@ def _metres(values: Sequence[float]) -> tuple[float, float, float]:
     return (x, y, z)
 
 
-def _check_ring12(code: int | None, where: str) -> None:
-    if code is None:
-        raise InvalidInput(f"{where}: a ring12 target needs its id (the number that its ring shows)")
-    if not 0 <= code < 4096:
-        raise InvalidInput(f"{where}: {code} is no ring12 id: twelve segments give 0 to 4095")
-    smallest = min(((code << k) | (code >> (12 - k))) & 0xFFF for k in range(12))
-    if smallest != code:
-        raise InvalidInput(
-            f"{where}: {code} is no ring12 id: the id is the smallest of the cyclic readings, here {smallest}"
-        )
+def check_ring_codes(body: BodyFile) -> None:
+    """Refuse ids that no ring can show; matters where rings are read, not where targets come identified.
+
+    Raises
+    ------
+    InvalidInput : an id is not the smallest of its cyclic readings.
+    """
+    for target in body.targets:
+        code = target.id
+        if target.code != "ring12" or code is None:
+            continue
+        if not 0 <= code < 4096:
+            raise InvalidInput(f"{body.path}: {code} is no ring12 id: twelve segments give 0 to 4095")
+        smallest = min(((code << k) | (code >> (12 - k))) & 0xFFF for k in range(12))
+        if smallest != code:
+            raise InvalidInput(
+                f"{body.path}: {code} is no ring12 id: the id is the smallest of its cyclic readings, here {smallest}"
+            )
 
 
 def write_body(

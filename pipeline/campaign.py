@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.body_file import BodyFile, read_body
+from pipeline.body_file import BodyFile, check_ring_codes, read_body
 from pipeline.camera_file import CameraFile, read_camera
 from pipeline.campaign_schema import FORMAT, CampaignEntry, StationCameraEntry, SurveyEntry
 from pipeline.images import list_images
@@ -54,7 +54,12 @@ class BodySource:
 
 @dataclass(frozen=True)
 class Campaign:
-    """Everything a run needs to know, in SI units."""
+    """Everything a run needs to know, in SI units.
+
+    Attributes
+    ----------
+    notes : what was assumed; warnings : what does not fit together but does not stop the work.
+    """
 
     path: Path
     entry: CampaignEntry
@@ -65,6 +70,7 @@ class Campaign:
     cameras: Mapping[str, ImageSource]
     measurements: tuple[MeasuredTable, ...]
     notes: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
     files: tuple[Path, ...] = field(default=(), repr=False)
 
     @property
@@ -127,6 +133,7 @@ class _Reader:
         self.document = read_yaml(path)
         self.entry = parse(self.document, CampaignEntry, FORMAT)
         self.notes: list[str] = []
+        self.warnings: list[str] = []
         self.files: list[Path] = [path]
 
     def read(self) -> Campaign:
@@ -145,7 +152,7 @@ class _Reader:
             read_measurements(self._file(name), poses.names if poses else ()) for name in entry.measurements
         )
         for table in measurements:
-            self.notes.extend(table.notes)
+            self.warnings.extend(table.notes)
             self._check_targets(table, bodies)
         return Campaign(
             path=self.path,
@@ -157,6 +164,7 @@ class _Reader:
             cameras=cameras,
             measurements=measurements,
             notes=tuple(self.notes),
+            warnings=tuple(self.warnings),
             files=tuple(dict.fromkeys(self.files)),
         )
 
@@ -198,6 +206,10 @@ class _Reader:
     def _body(self, name: str) -> BodySource:
         use = self.entry.bodies[name]
         file = read_body(self._file(use.targets))
+        station = self.entry.station
+        watched = station is not None and station.body == name and any(c.images for c in station.cameras.values())
+        if watched or (use.survey is not None and use.survey.images):
+            check_ring_codes(file)
         if use.survey is None:
             return BodySource(file)
         place = ("bodies", name, "survey")
@@ -262,13 +274,13 @@ class _Reader:
                 f"'{poses.names[0]}'): the file stem must be the pose id"
             )
         for name in strangers:
-            self.notes.append(f"{source.images[name]}: no pose '{name}' in {poses.path.name}: the image is not used")
+            self.warnings.append(f"{source.images[name]}: no pose '{name}' in {poses.path.name}: the image is not used")
         have = set(source.names)
         missing = [name for name in poses.names if name not in have]
         for name in missing[:5]:
-            self.notes.append(f"{poses.path}: pose '{name}' has no image of camera '{camera}'")
+            self.warnings.append(f"{poses.path}: pose '{name}' has no image of camera '{camera}'")
         if len(missing) > 5:
-            self.notes.append(f"{poses.path}: {len(missing) - 5} more poses have no image of camera '{camera}'")
+            self.warnings.append(f"{poses.path}: {len(missing) - 5} more poses have no image of camera '{camera}'")
         return replace(source, images={name: p for name, p in source.images.items() if name in known})
 
     def _poses_from_images(self, cameras: Mapping[str, ImageSource]) -> Poses:

@@ -31,10 +31,10 @@ class StaleCache(RobcalError):
 
 def encode(value: Any, arrays: dict[str, np.ndarray]) -> Any:
     """Plain JSON data of a value; arrays go into ``arrays`` by key."""
+    if isinstance(value, enum.Enum):  # before str and int, which an enum may also be
+        return {"$": "enum", "class": _class_name(type(value)), "value": encode(value.value, arrays)}
     if value is None or isinstance(value, bool | str):
         return value
-    if isinstance(value, enum.Enum):
-        return {"$": "enum", "class": _class_name(type(value)), "value": encode(value.value, arrays)}
     if isinstance(value, np.ndarray):
         if value.dtype == object:
             return {"$": "objects", "shape": list(value.shape), "items": [encode(v, arrays) for v in value.ravel()]}

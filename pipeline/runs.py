@@ -1,6 +1,6 @@
 """The run folder: the only place that knows where artifacts lie, whether they are up to date, and who may write.
 
-Every file is written to a temporary name and renamed. A stage is done when its record (``state/<stage>.json``) is there;
+Every file is written to a temporary name and renamed. A stage is done when its record (``state/<stage>.json``) stands;
 the record is written last, so a run killed at any moment resumes with the stage it was in.
 """
 

@@ -1,1 +1,1 @@
-"""One short file a stage: load, call the library, save."""
+"""One short module a stage: load, call the library, save, say what came out."""

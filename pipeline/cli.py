@@ -1,0 +1,270 @@
+"""Command line: thin commands that call the pipeline and turn errors into one line and an exit code.
+
+Exit codes: 0 done, 1 the data cannot give a result, 2 wrong use.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import tempfile
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from pipeline.messages import Messages
+from pipeline.runs import plain
+from robcal.errors import RobcalError
+
+app = typer.Typer(
+    name="pipeline",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    help="From photographs to an accurate robot: survey, measurement, identification, diagnosis, compensation.",
+)
+
+Quiet = Annotated[bool, typer.Option("-q", "--quiet", help="Only warnings and errors on standard error.")]
+Json = Annotated[bool, typer.Option("--json", help="One result line for programs on standard output.")]
+Workers = Annotated[int | None, typer.Option("--workers", min=1, max=1024, help="Processes for work on images.")]
+RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder of a finished campaign.")]
+CampaignPath = Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="Campaign folder, or its YAML file.")]
+
+
+@contextmanager
+def _answers(command: str, as_json: bool) -> Iterator[dict[str, Any]]:
+    """Run a command's body; errors on purpose become one line and exit code 1, a mistake of the program too."""
+    answer: dict[str, Any] = {}
+    try:
+        yield answer
+    except RobcalError as error:
+        _fail(command, as_json, " ".join(str(error).split()))
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename else ""
+        _fail(command, as_json, f"{where}{error.strerror or error}")
+    except MemoryError:
+        _fail(command, as_json, "not enough memory: use smaller images or fewer at once")
+    except Exception as error:
+        with tempfile.NamedTemporaryFile("w", prefix="robcal-", suffix=".log", delete=False) as stream:
+            stream.write(traceback.format_exc())
+        _fail(command, as_json, f"internal error ({type(error).__name__}): the traceback is in {stream.name}")
+    if as_json:
+        typer.echo(json.dumps(plain({"ok": True, "command": command, **answer}), ensure_ascii=False))
+
+
+def _fail(command: str, as_json: bool, sentence: str) -> None:
+    typer.echo(f"error: {sentence}", err=True)
+    if as_json:
+        typer.echo(json.dumps({"ok": False, "command": command, "error": sentence}, ensure_ascii=False))
+    raise typer.Exit(1)
+
+
+def _wrong_use(sentence: str) -> None:
+    typer.echo(f"wrong use: {sentence}", err=True)
+    raise typer.Exit(2)
+
+
+def _check_stage(*names: str | None) -> None:
+    from pipeline.runner import STAGE_NAMES
+    from pipeline.schemas import proposal
+
+    for name in names:
+        if name is not None and name not in STAGE_NAMES:
+            _wrong_use(f"there is no stage '{name}'{proposal(name, list(STAGE_NAMES))}")
+
+
+def _summary(done: Any) -> dict[str, Any]:
+    run = done.run
+    return {"run": str(run.folder), "report": str(run.report), "ran": done.ran, "skipped": done.skipped} | {
+        key: value for key, value in done.result.items() if key not in ("format", "notes")
+    }
+
+
+@app.command()
+def run(
+    campaign: CampaignPath,
+    out: Annotated[Path | None, typer.Option("--out", help="Run folder; default runs/<campaign name>.")] = None,
+    until: Annotated[str | None, typer.Option("--until", metavar="STAGE", help="Last stage to run.")] = None,
+    start: Annotated[str | None, typer.Option("--from", metavar="STAGE", help="First stage to run again.")] = None,
+    workers: Workers = None,
+    quiet: Quiet = False,
+    as_json: Json = False,
+) -> None:
+    """Run all stages that the campaign has input for; resumes, and skips what is up to date.
+
+    Stages: detect, survey, orient, measure, frames, identify, diagnose, verify, report.
+    """
+    _check_stage(until, start)
+    with _answers("run", as_json) as answer:
+        from pipeline.runner import run_campaign
+
+        messages = Messages(quiet)
+        done = run_campaign(campaign, out, until=until, start=start, messages=messages, workers=workers)
+        answer.update(_summary(done))
+        messages.info(f"results in {done.run.folder}")
+
+
+@app.command()
+def survey(
+    campaign: CampaignPath,
+    body: Annotated[str | None, typer.Option("--body", help="Name of the body; default all with a survey.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", help="Run folder; default runs/<campaign name>.")] = None,
+    workers: Workers = None,
+    quiet: Quiet = False,
+    as_json: Json = False,
+) -> None:
+    """Only the bundle adjustment of the campaign's bodies."""
+    with _answers("survey", as_json) as answer:
+        from pipeline.commands import survey_campaign
+
+        done = survey_campaign(campaign, body, out, Messages(quiet), workers)
+        answer.update(_summary(done))
+
+
+@app.command()
+def diagnose(
+    place: Annotated[Path, typer.Argument(metavar="CAMPAIGN_OR_RUN", help="Campaign folder or run folder.")],
+    out: Annotated[Path | None, typer.Option("--out", help="Run folder, when a campaign is named.")] = None,
+    workers: Workers = None,
+    quiet: Quiet = False,
+    as_json: Json = False,
+) -> None:
+    """Say what physics the model lacks: only the diagnosis (also a stage of `run`)."""
+    with _answers("diagnose", as_json) as answer:
+        from pipeline.commands import diagnose_place
+
+        messages = Messages(quiet)
+        done, diagnosis = diagnose_place(place, out, messages, workers)
+        answer.update({"run": str(done.run.folder), "diagnosis": diagnosis})
+        for cause in diagnosis.get("causes", []):
+            messages.info(str(cause.get("statement") or cause.get("cause")))
+        if not diagnosis.get("causes"):
+            messages.info("nothing missing: model and recordings agree within their noise")
+
+
+@app.command()
+def predict(
+    run_folder: RunFolder,
+    poses: Annotated[Path, typer.Option("--poses", help="Joint angles: pose, q1_deg, ... as in poses.csv.")],
+    out: Annotated[Path, typer.Option("--out", help="Table of frames to write.")],
+    nominal: Annotated[
+        bool, typer.Option("--nominal", help="The uncalibrated robot after the best cell calibration.")
+    ] = False,
+    quiet: Quiet = False,
+    as_json: Json = False,
+) -> None:
+    """Say where the calibrated robot's tool really is, in the measuring system's coordinates."""
+    with _answers("predict", as_json) as answer:
+        from pipeline.prediction import predict_run
+
+        answer.update(predict_run(run_folder, poses, out, nominal=nominal))
+        Messages(quiet).info(f"{answer['poses']} frames in {out}")
+
+
+@app.command()
+def compensate(
+    run_folder: RunFolder,
+    frames: Annotated[Path, typer.Option("--frames", help="Wanted tool frames; column payload if loads differ.")],
+    out: Annotated[Path, typer.Option("--out", help="Table of joint angles (or targets) to write.")],
+    kind: Annotated[str, typer.Option("--as", metavar="joints|frames", help="Joint angles, or targets F*.")] = "joints",
+    system: Annotated[
+        str, typer.Option("--in", metavar="world|base", help="Coordinates of the frames: measuring system or base.")
+    ] = "world",
+    quiet: Quiet = False,
+    as_json: Json = False,
+) -> None:
+    """Find the commands that bring the real tool to the wanted frames."""
+    if kind not in ("joints", "frames"):
+        _wrong_use(f"--as is 'joints' or 'frames', not '{kind}'")
+    if system not in ("world", "base"):
+        _wrong_use(f"--in is 'world' or 'base', not '{system}'")
+    with _answers("compensate", as_json) as answer:
+        from pipeline.prediction import compensate_run
+
+        answer.update(compensate_run(run_folder, frames, out, as_frames=kind == "frames", in_base=system == "base"))
+        messages = Messages(quiet)
+        for sentence in answer["warnings"]:
+            messages.warn(sentence)
+        messages.info(f"{answer['frames']} rows in {out}, remaining error at most {answer['remaining_max_mm']:.4f} mm")
+
+
+@app.command()
+def report(run_folder: RunFolder, quiet: Quiet = False, as_json: Json = False) -> None:
+    """Write the report again."""
+    with _answers("report", as_json) as answer:
+        from pipeline.commands import report_again
+
+        path = report_again(run_folder)
+        answer["report"] = str(path)
+        Messages(quiet).info(str(path))
+
+
+@app.command()
+def demo(
+    out: Annotated[Path, typer.Option("--out", help="Folder for the rendered campaign and its run.")] = Path("demo"),
+    workers: Workers = None,
+    quiet: Quiet = False,
+    as_json: Json = False,
+) -> None:
+    """Render a small campaign and run it; the last line is the path of the report."""
+    with _answers("demo", as_json) as answer:
+        from pipeline.commands import run_demo
+
+        done = run_demo(out, Messages(quiet), workers)
+        answer.update(_summary(done))
+        if not as_json:
+            typer.echo(str(done.run.report))
+
+
+@app.command()
+def poses(
+    config: Annotated[Path, typer.Argument(metavar="CONFIG", help="YAML file of the format robcal/poses-1.")],
+    out: Annotated[Path, typer.Option("--out", help="Table of poses to write.")],
+    quiet: Quiet = False,
+    as_json: Json = False,
+) -> None:
+    """Generate measuring poses: within limits, visible, free of collisions, as few as the wanted accuracy needs."""
+    with _answers("poses", as_json) as answer:
+        from pipeline.pose_generation import generate_poses
+
+        messages = Messages(quiet)
+        answer.update(generate_poses(config, out))
+        messages.info(f"{answer['poses']} poses in {out}")
+
+
+@app.command()
+def export(
+    run_folder: RunFolder,
+    c: Annotated[Path | None, typer.Option("--c", help="Folder for C99 source of the model and its inverse.")] = None,
+    urdf: Annotated[Path | None, typer.Option("--urdf", help="URDF file of the calibrated robot.")] = None,
+    quiet: Quiet = False,
+    as_json: Json = False,
+) -> None:
+    """Export the calibrated robot for controllers and simulators."""
+    if c is None and urdf is None:
+        _wrong_use("name what to write: --c FOLDER, --urdf FILE, or both")
+    with _answers("export", as_json) as answer:
+        from pipeline.exports import export_run
+
+        written = export_run(run_folder, c, urdf)
+        answer["files"] = [str(path) for path in written]
+        for path in written:
+            Messages(quiet).info(str(path))
+
+
+def main() -> None:
+    """Entry point of the console script."""
+    try:
+        app()
+    except BrokenPipeError:  # the reader of our output went away, as in `pipeline ... | head`
+        sys.stderr.close()
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,227 @@
+"""Runs the stages of a campaign in order: skips what is up to date, resumes what was interrupted."""
+
+from __future__ import annotations
+
+import os
+import time
+import traceback
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pipeline.campaign import Campaign, read_campaign
+from pipeline.codec import StaleCache
+from pipeline.messages import Messages
+from pipeline.runs import Run, StageRecord, code_version, fingerprint, read_json, write_json
+from pipeline.schemas import proposal
+from pipeline.stages.base import Context, Outcome, Stage
+from pipeline.stages.registry import STAGES
+from robcal.errors import InvalidInput, RobcalError
+
+STAGE_NAMES = tuple(stage.name for stage in STAGES)
+RUN_FORMAT = "robcal/run-1"
+
+
+class InternalError(RobcalError):
+    """A mistake of this program; the traceback is in log.txt."""
+
+
+@dataclass(frozen=True)
+class Done:
+    """What a run did."""
+
+    run: Run
+    ran: tuple[str, ...]
+    skipped: tuple[str, ...]
+    result: dict[str, Any]
+
+
+def default_folder(campaign: Campaign) -> Path:
+    """``runs/<campaign name>`` in the current folder."""
+    return Path("runs") / campaign.name
+
+
+def processes() -> int:
+    """Processors that this process may use."""
+    affinity = getattr(os, "sched_getaffinity", None)
+    return len(affinity(0)) if affinity else os.cpu_count() or 1
+
+
+def open_run(path: Path) -> Run:
+    """The run in a folder.
+
+    Raises
+    ------
+    InvalidInput : the folder holds no run.
+    """
+    run = Run(path)
+    if not _run_file(run).is_file():
+        raise InvalidInput(f"{path}: is not a run folder: name the folder that 'pipeline run' wrote (its --out)")
+    return run
+
+
+def is_run(path: Path) -> bool:
+    """Whether a folder holds a run."""
+    return _run_file(Run(path)).is_file()
+
+
+def campaign_of(run: Run) -> Path:
+    """Path of the campaign that a run belongs to."""
+    return Path(str(read_json(_run_file(run)).get("campaign", "")))
+
+
+def _run_file(run: Run) -> Path:
+    return run.folder / "state" / "run.json"
+
+
+def run_campaign(
+    path: Path,
+    out: Path | None = None,
+    *,
+    until: str | None = None,
+    start: str | None = None,
+    only: Sequence[str] | None = None,
+    messages: Messages | None = None,
+    workers: int | None = None,
+) -> Done:
+    """Run a campaign.
+
+    Parameters
+    ----------
+    until : last stage to run; start : first stage that runs even if it is up to date.
+    only : restrict the run to these stages.
+
+    Raises
+    ------
+    InvalidInput : the campaign or a stage's name is wrong; any other RobcalError of a stage, told with its file.
+    InternalError : a mistake of this program.
+    """
+    for name in (until, start):
+        if name is not None and name not in STAGE_NAMES:
+            raise InvalidInput(f"there is no stage '{name}'{proposal(name, list(STAGE_NAMES))}")
+    if until and start and STAGE_NAMES.index(until) < STAGE_NAMES.index(start):
+        raise InvalidInput(f"stage '{until}' comes before '{start}': --until must not lie before --from")
+    messages = messages or Messages(quiet=True)
+    campaign = read_campaign(path)
+    run = Run(out or default_folder(campaign))
+    _keep_inputs_apart(campaign, run)
+    with run.lock():
+        messages.log = run.log
+        messages.record(f"run of {campaign.path} in {run.folder}")
+        _adopt(run, campaign)
+        run.load_hashes()
+        context = Context(campaign, run, messages, workers or processes())
+        for note in campaign.notes:
+            messages.info(note)
+        for warning in campaign.warnings:
+            messages.warn(warning)
+        try:
+            return _run_stages(context, until, start, only)
+        finally:
+            run.save_hashes()
+
+
+def _keep_inputs_apart(campaign: Campaign, run: Run) -> None:
+    folder = campaign.path.parent.resolve()
+    if run.folder.resolve() == folder:
+        raise InvalidInput(f"{run.folder}: is the campaign itself, which is never written to: choose another --out")
+
+
+def _adopt(run: Run, campaign: Campaign) -> None:
+    path = _run_file(run)
+    here = str(campaign.path.resolve())
+    if path.is_file() and campaign_of(run) != Path(here):
+        before = read_json(path).get("name")
+        if before != campaign.name:
+            raise InvalidInput(
+                f"{run.folder}: holds the run of another campaign ('{before}'): choose another folder with --out"
+            )
+    write_json(path, {"format": RUN_FORMAT, "campaign": here, "name": campaign.name})
+
+
+def _run_stages(context: Context, until: str | None, start: str | None, only: Sequence[str] | None) -> Done:
+    campaign, run, messages = context.campaign, context.run, context.messages
+    stages = [stage for stage in STAGES if stage.applies(campaign)]
+    names = [stage.name for stage in stages]
+    ran: list[str] = []
+    skipped: list[str] = []
+    for stage in stages:
+        if until and STAGE_NAMES.index(stage.name) > STAGE_NAMES.index(until):
+            break
+        if only is not None and stage.name not in only:
+            continue
+        missing = [name for name in stage.after if name in names and run.record(name) is None]
+        if missing:
+            raise InvalidInput(f"stage '{stage.name}' needs the stage '{missing[0]}': run the whole campaign first")
+        forced = start is not None and STAGE_NAMES.index(stage.name) >= STAGE_NAMES.index(start)
+        key = stage_key(stage, context, names)
+        if not forced and run.up_to_date(stage.name, key):
+            skipped.append(stage.name)
+            messages.info(f"{stage.name}: up to date")
+            continue
+        run.forget(stage.name)
+        _run_stage(stage, key, context)
+        ran.append(stage.name)
+    result = collect_result(run, campaign, names)
+    run.write_result(result)
+    return Done(run, tuple(ran), tuple(skipped), result)
+
+
+def _run_stage(stage: Stage, key: str, context: Context) -> None:
+    run, messages = context.run, context.messages
+    messages.info(f"{stage.name}: ...")
+    begin = time.perf_counter()
+    try:
+        outcome = stage.work(context)
+    except StaleCache as error:
+        raise InvalidInput(f"{error}") from None
+    except RobcalError as error:
+        messages.record(f"stage {stage.name} failed: {error}")
+        raise
+    except MemoryError:
+        raise InvalidInput(f"stage {stage.name}: not enough memory: use smaller images or fewer at once") from None
+    except Exception as error:
+        messages.record(traceback.format_exc())
+        raise InternalError(
+            f"stage {stage.name}: internal error ({type(error).__name__}): the traceback is in {run.log}"
+        ) from error
+    seconds = time.perf_counter() - begin
+    finish(run, stage.name, key, outcome, seconds)
+    for note in outcome.notes:
+        messages.info(f"  {note}")
+    messages.info(f"{stage.name}: done in {seconds:.1f} s")
+
+
+def finish(run: Run, stage: str, key: str, outcome: Outcome, seconds: float) -> None:
+    """Write the record of a finished stage."""
+    outputs = run.outputs(list(outcome.outputs))
+    run.write_record(StageRecord(stage, key, outputs, dict(outcome.result), tuple(outcome.notes), seconds))
+
+
+def stage_key(stage: Stage, context: Context, applying: Sequence[str]) -> str:
+    """Hash of everything that the result of a stage depends on."""
+    run, campaign = context.run, context.campaign
+    files = {str(path): run.hash(path) for path in stage.inputs(campaign)}
+    upstream = {}
+    for name in stage.after:
+        record = run.record(name) if name in applying else None
+        upstream[name] = dict(record.outputs) if record else None
+    return fingerprint(stage.name, files, stage.settings(campaign), upstream, code_version(*stage.code))
+
+
+def collect_result(run: Run, campaign: Campaign, names: Sequence[str]) -> dict[str, Any]:
+    """result.json from the records of all finished stages."""
+    result: dict[str, Any] = {"format": "robcal/result-1", "campaign": campaign.name}
+    timing: dict[str, float] = {}
+    notes: list[str] = [*campaign.notes, *campaign.warnings]
+    for name in STAGE_NAMES:
+        record = run.record(name) if name in names else None
+        if record is None:
+            continue
+        result.update(record.result)
+        timing[name] = round(record.seconds, 3)
+        notes.extend(record.notes)
+    result["timing"] = timing
+    result["notes"] = notes
+    return result
