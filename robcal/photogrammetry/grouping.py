@@ -1,0 +1,23 @@
+"""Sums over groups of rows (all marks of an image, all rays of a point): the inner loops of batched adjustments."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from robcal.transforms import Array
+
+
+def sum_by(group: NDArray[np.int64], values: Array, n: int) -> Array:
+    """Sums of ``values`` (m, ...) over equal numbers in ``group`` (m,), shape (n, ...)."""
+    m = len(group)
+    if m == 0:
+        return np.zeros((n, *values.shape[1:]))
+    adder = sparse.csr_matrix((np.ones(m), (group, np.arange(m))), shape=(n, m))
+    return np.asarray(adder @ values.reshape(m, -1)).reshape(n, *values.shape[1:])
+
+
+def whitener(covariance: Array) -> Array:
+    """Matrices W (..., k, k) with ``W' W = inverse(covariance)`` (inverse Cholesky factors)."""
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)))
