@@ -32,7 +32,9 @@ def survey_campaign(path: Path, body: str | None, out: Path | None, messages: Me
     return run_campaign(path, out, only=("detect", "survey"), messages=messages, workers=workers, body=body)
 
 
-def diagnose_place(place: Path, out: Path | None, messages: Messages, workers: int | None) -> tuple[Done, dict[str, Any]]:
+def diagnose_place(
+    place: Path, out: Path | None, messages: Messages, workers: int | None
+) -> tuple[Done, dict[str, Any]]:
     """The diagnosis of a campaign or of a finished run, and what has to come before it.
 
     Raises

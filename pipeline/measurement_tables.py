@@ -110,7 +110,8 @@ def _kind(table: Table) -> Kind:
     if table.has("roll_deg") or table.has("pitch_deg") or table.has("yaw_deg"):
         return "frames"
     if table.has("target"):
-        return "sensor_points" if table.has("cycle") or table.has("time_s") or "sensor" in table.path.stem.lower() else "points"
+        in_sensor = table.has("cycle") or table.has("time_s") or "sensor" in table.path.stem.lower()
+        return "sensor_points" if in_sensor else "points"
     table.require(["pose"])
     raise InvalidInput(
         f"{table.path}, row 1: the columns are of no known kind: points need pose, target, x_mm, y_mm, z_mm; frames "

@@ -56,7 +56,7 @@ def in_processes(work: Callable[[A], B], items: Sequence[A], workers: int) -> It
             try:
                 yield from pool.map(work, items)
             except BrokenProcessPool:
-                raise InvalidInput("a worker process died, probably for lack of memory: free some and run again") from None
+                raise InvalidInput("a worker process died, probably for lack of memory: run again with --workers 1") from None
             finally:
                 pool.shutdown(cancel_futures=True)
     finally:
