@@ -105,15 +105,14 @@ def inverse_kinematics(
     start = _start(chain, near, len(frames))
     if len(frames) == 0:
         return _finish(chain, frames, start, np.empty((0, 1, chain.n_joints)), "numeric")
-    structure = find_structure(chain)
-    if structure is not None:
+    arm, first = carried_arm(chain)
+    structure = find_structure(arm) if arm is not None else None
+    if arm is not None and structure is not None:
+        if first:
+            return _on_track(chain, arm, structure, frames, start)
         method = "spherical wrist" if isinstance(structure, SphericalWrist) else "parallel arm"
         q = _polish(chain, frames, _closed_form(chain, structure, frames, start))
         return _finish(chain, frames, start, q, method)
-    rest = _without_track(chain)
-    structure = find_structure(rest) if rest is not None else None
-    if rest is not None and structure is not None:
-        return _on_track(chain, rest, structure, frames, start)
     q = search(chain, frames, start, settings or NumericSettings(), all_branches=all_branches)
     return _finish(chain, frames, start, q, "numeric")
 
@@ -279,14 +278,18 @@ def _finish(chain: Chain, frames: Array, near: Array, q: Array, method: str) -> 
     return InverseSolutions(chain, frames, near, turned, _respects(turned, excess), excess, method)
 
 
-def _without_track(chain: Chain) -> Chain | None:
-    """The six-axis arm that a sliding first joint carries, with the track at zero; None if there is no such track."""
+def carried_arm(chain: Chain) -> tuple[Chain | None, int]:
+    """The arm that may have a closed form, and the index of its first joint: the chain itself, or what a track carries.
+
+    The track (a sliding first joint under six rotary ones) is taken at zero; None where the chain is of another kind.
+    """
     if chain.n_joints != 7 or not chain.prismatic[0] or bool(np.any(chain.prismatic[1:])):
-        return None
-    return Chain(
+        return (chain, 0) if chain.n_joints == 6 else (None, 0)
+    arm = Chain(
         chain.names[1:], chain.prismatic[1:], chain.axes[1:], chain.points[1:], chain.home, chain.frames_home,
         np.maximum(chain.moved_by - 1, -1), chain.lower[1:], chain.upper[1:],
     )  # fmt: skip
+    return arm, 1
 
 
 def _on_track(chain: Chain, arm: Chain, structure: Structure, frames: Array, near: Array) -> InverseSolutions:

@@ -44,7 +44,7 @@ def solve_spherical_wrist(chain: Chain, structure: SphericalWrist, base_T_flange
     t4 = np.where(aligned[..., None], near[:, None, None, 3], t4)
     kept = rotate(w[3], -t4, np.broadcast_to(pointing[..., None, :], (*t4.shape, 3)))
     t5 = np.where(aligned[..., None], angle_between(w[4], np.broadcast_to(w[5], kept.shape), kept), t5)
-    probe = _perpendicular(w[5])
+    probe = perpendicular(w[5])
     turned = np.einsum("nbij,j->nbi", wrist, probe)
     turned = np.broadcast_to(turned[..., None, :], (*t4.shape, 3))
     turned = rotate(w[4], -t5, rotate(w[3], -t4, turned))
@@ -119,7 +119,7 @@ def solve_parallel_arm(chain: Chain, structure: ParallelArm, base_T_flange: Arra
     q3 = to_distance(w[2], p[3] - p[2], p[1] - p[2], reach2).reshape(n, 8)
     placed = p[2] + rotate(w[2], q3, p[3] - p[2])
     q2 = angle_between(w[1], placed - p[1], carried - p[1])
-    probe = _perpendicular(n_)
+    probe = perpendicular(n_)
     ahead = _point_through(chain, D, q1, q5, q6, p[3] + probe) - carried
     ahead = rotate(w[2], -q3, rotate(w[1], -q2, ahead))
     q4 = angle_between(w[3], np.broadcast_to(probe, ahead.shape), ahead)
@@ -143,7 +143,7 @@ def _combine(*angles: Array) -> Array:
     return stacked.reshape(len(stacked), -1, len(angles))
 
 
-def _perpendicular(direction: Array) -> Array:
+def perpendicular(direction: Array) -> Array:
     """A unit vector across a direction."""
     other = np.eye(3)[np.argmin(np.abs(direction))]
     v = np.cross(direction, other)
