@@ -30,6 +30,7 @@ class Tangents:
     parameters: Mapping[str, Array]
     variables: Mapping[str, Array]
     row_pose: Array
+    frames: Array
     data: ObservationData
 
     def columns(self, family: Family, constants: Constants) -> Array:
@@ -37,7 +38,7 @@ class Tangents:
         if family.frees:
             return np.stack([self.parameters[name] for name in family.frees], axis=1)
         if family.displace is not None:
-            return self.recording.whiten(family.displace(self.data, constants))
+            return self.recording.whiten(family.displace(self.data, constants), self.frames)
         names = family.names(constants)
         out = np.zeros((len(self.row_pose), len(names)))
         if family.bases is not None:
@@ -58,7 +59,7 @@ def tangents(fit: Fit, recording: Recording) -> Tangents:
     variables = kernel.variables(fit.theta, fit.inputs)
     return Tangents(
         recording, {(key[0], key[1]): motion[:, i] for i, key in enumerate(keys)},
-        {name: whitened[:, i] for i, name in enumerate(kernel.names)}, variables, fit.row_pose,
+        {name: whitened[:, i] for i, name in enumerate(kernel.names)}, variables, fit.row_pose, fit.frames,
         observation_data(recording, fit.frames, variables),
     )
 

@@ -66,12 +66,12 @@ def cross_validated(recording: Recording, fitted: Fit, labels: Array) -> Array:
         test = fold_of_row == fold
         step, _ = solve(fitted.jacobian[~test], fitted.residual[~test])
         predicted[test] = fitted.residual[test] - fitted.jacobian[test] @ step
-    return recording.unwhiten(predicted[:, None])[:, : min(per, 3), 0]
+    return recording.unwhiten(predicted[:, None], fitted.frames)[:, : min(per, 3), 0]
 
 
 def noise_floor(recording: Recording, factor: float) -> float:
     """Root mean square of the position error that the measurement itself has, metres."""
-    covariance = np.asarray(recording.observations.covariance)
-    if covariance.ndim == 1:
-        return float(np.sqrt(np.mean(covariance) * factor))
+    if isinstance(recording.observations, DistanceObservations):
+        return float(np.sqrt(np.mean(recording.observations.sigma**2) * factor))
+    covariance = recording.observations.covariance
     return float(np.sqrt(np.mean(np.trace(covariance[:, :3, :3], axis1=1, axis2=2)) * factor))

@@ -3,23 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
 from robcal.calibration.observations import (
     DistanceObservations,
     FrameObservations,
-    Observations,
     PointObservations,
     SensorPointObservations,
 )
 from robcal.diagnosis.decorrelation import SharedNoise
+from robcal.diagnosis.scan import orthonormal_basis
 from robcal.errors import InvalidInput
 from robcal.physics.family import Constants, Family, ObservationData
 from robcal.robot.kernel import Kernel, PoseInputs
 from robcal.robot.model import RobotModel, Term
 from robcal.transforms import Array, transform
+
+SpatialObservations = FrameObservations | PointObservations | DistanceObservations | SensorPointObservations
 
 
 @dataclass(frozen=True)
@@ -40,7 +42,7 @@ class Recording:
     payload: tuple[str | None, ...]
     covariates: Mapping[str, Array]
     names: tuple[str, ...]
-    observations: Observations
+    observations: SpatialObservations
     body: str = "body"
     ids: tuple[int, ...] = ()
     shared: SharedNoise | None = None
@@ -52,14 +54,17 @@ class Recording:
             return residual, jacobian
         return self.shared.whiten(residual), self.shared.whiten(jacobian)
 
-    def whiten(self, displacement: Array) -> Array:
-        """Whitened rows (m, p) of displacements (m_obs, k, p) of the observations."""
-        rows = self.observations.whiten(displacement)
+    def whiten(self, displacement: Array, frames: Array) -> Array:
+        """Whitened rows (m, p) of displacements (m_obs, k, p) of the observations; frames (n, 4, 4) as modelled."""
+        L = np.linalg.cholesky(self.observations.noise(frames))
+        rows = np.linalg.solve(L, displacement).reshape(-1, displacement.shape[2])
         return rows if self.shared is None else self.shared.whiten(rows)
 
-    def unwhiten(self, rows: Array) -> Array:
+    def unwhiten(self, rows: Array, frames: Array) -> Array:
         """Displacements (m_obs, k, p) of whitened rows (m, p); inverse of :meth:`whiten`."""
-        return self.observations.unwhiten(rows if self.shared is None else self.shared.unwhiten(rows))
+        plain = rows if self.shared is None else self.shared.unwhiten(rows)
+        L = np.linalg.cholesky(self.observations.noise(frames))
+        return np.asarray(L @ plain.reshape(len(L), -1, rows.shape[1]))
 
     def pose_name(self, index: float) -> str:
         """Name of the pose with a value of the covariate `index`."""
@@ -83,21 +88,27 @@ class Recording:
         """Without the observations of the given indices."""
         keep = np.setdiff1d(np.arange(len(self.observations.pose)), drop)
         shared = None if self.shared is None else self.shared.subset(keep)
-        return replace(self, observations=self.observations.subset(keep), shared=shared)
+        return replace(self, observations=_rows(self.observations, keep), shared=shared)
 
     def subset(self, keep: Array) -> Recording:
         """Only the poses where `keep` (n,) is true; observations of the others are left out."""
         rows = np.flatnonzero(keep)
         number = np.full(len(self.q), -1)
         number[rows] = np.arange(len(rows))
-        chosen = np.flatnonzero(keep[self.observations.pose])
-        observations = self.observations.subset(chosen)
+        observations = _rows(self.observations, np.flatnonzero(keep[self.observations.pose]))
         observations = replace(observations, pose=number[observations.pose])
         return replace(
             self, q=self.q[rows], payload=tuple(self.payload[i] for i in rows), names=tuple(self.names[i] for i in rows),
             covariates={name: np.asarray(values)[rows] for name, values in self.covariates.items()},
             observations=observations, shared=None,
         )
+
+
+def _rows(observations: SpatialObservations, keep: Array) -> SpatialObservations:
+    """The observations of the given indices; poses keep their numbers."""
+    count = len(observations.pose)
+    arrays = {field.name: getattr(observations, field.name) for field in fields(observations)}
+    return replace(observations, **{name: v[keep] for name, v in arrays.items() if np.shape(v)[:1] == (count,)})
 
 
 @dataclass(frozen=True)
@@ -144,7 +155,7 @@ class Fit:
     @property
     def redundancy(self) -> int:
         """Observations less parameters."""
-        return int(len(self.residual) - np.linalg.matrix_rank(self.jacobian / np.linalg.norm(self.jacobian, axis=0)))
+        return len(self.residual) - orthonormal_basis(self.jacobian).shape[1]
 
     @property
     def variance_factor(self) -> float:
@@ -196,7 +207,7 @@ def terms_of(accepted: Accepted, number: int) -> tuple[Term, ...]:
 
 def fit(
     model: RobotModel, recording: Recording, free: Sequence[str], accepted: Sequence[Accepted] = (),
-    *, iterations: int = 8, statics: str = "one_step",
+    *, iterations: int = 8, statics: str = "converged",
 ) -> Fit:
     """Least squares of the free parameters and all accepted causes together, from the model's present values.
 
@@ -204,7 +215,7 @@ def fit(
     """
     for number, item in enumerate(accepted):
         model = model.with_terms(terms_of(item, number))
-    kernel = Kernel(model)
+    kernel = Kernel(model, statics)
     inputs = recording.inputs(kernel)
     names = list(dict.fromkeys([*free, *(n for a in accepted for n in a.family.frees)]))
     names += [full for term in model.terms for full in term.parameter_names if full not in names]
@@ -220,7 +231,7 @@ def fit(
         residual, jacobian = recording.linearise(frames, J)
         if direct:
             data = observation_data(recording, frames, kernel.variables(theta, inputs))
-            extra = [recording.whiten(item.family.displace(data, item.constants)) for item in direct]  # type: ignore[misc]
+            extra = [recording.whiten(item.family.displace(data, item.constants), frames) for item in direct]  # type: ignore[misc]
             jacobian = np.concatenate([jacobian, *extra], axis=1)
         step, size = solve(jacobian, residual)
         theta[columns] += step[: len(columns)]
@@ -232,7 +243,7 @@ def fit(
     residual, jacobian = recording.linearise(frames, J)
     if direct:
         data = observation_data(recording, frames, kernel.variables(theta, inputs))
-        extra = [recording.whiten(item.family.displace(data, item.constants)) for item in direct]  # type: ignore[misc]
+        extra = [recording.whiten(item.family.displace(data, item.constants), frames) for item in direct]  # type: ignore[misc]
         jacobian = np.concatenate([jacobian, *extra], axis=1)
     step, size = solve(jacobian, residual)
     step[: len(columns)] = 0.0 if not direct else step[: len(columns)]

@@ -119,5 +119,5 @@ def exponential_law(start_s: float, duration_h: float, tau_h: float) -> str:
     """Expression of a warming up that reaches `duration_h` (hours) at the end with time constant `tau_h`."""
     if not np.isfinite(tau_h):
         return f"((time_s - {start_s!r})/3600)"
-    scale = duration_h / -np.expm1(-duration_h / tau_h)
+    scale = float(duration_h / -np.expm1(-duration_h / tau_h))
     return f"({scale!r}*(1 - exp(-(time_s - {start_s!r})/{3600.0 * tau_h!r})))"
