@@ -1,22 +1,26 @@
 """Gauss-Newton with halving line search, dependent parameters, covariance and redundancy of a whitened problem.
 
-A problem is a function ``linearise(theta) -> (r, J)`` with whitened residuals ``r = measured - model`` (m,) and
-``J = d model / d theta`` (m, p), so a step solves ``min |r - J d|``.
+A problem is linearised at a state as whitened residuals ``r = measured - model`` (m,) and ``J = d model / d step`` (m, p),
+so a step solves ``min |r - J step|``. The state may be anything that a step can move (an array, a frame, a network).
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
+from scipy import linalg, stats
 
-from robcal.errors import NotIdentifiable
+from robcal.errors import InvalidInput
 
 Array = NDArray[np.float64]
+State = TypeVar("State")
+
+RELATIVE_PIVOT = 1e-11  # squared; below this a column is numerically a combination of others
 
 
 @dataclass(frozen=True)
@@ -27,7 +31,8 @@ class TerminationSettings:
     ----------
     max_iterations : Gauss-Newton steps at most.
     max_halvings : halvings of one step at most.
-    cost_tolerance : stop when a step promises to lower the cost by less than this fraction (plus the same of one).
+    cost_tolerance : stop when a step lowers, or promises to lower, half the sum of squares by less than this fraction
+        of it (plus the same fraction of one).
     """
 
     max_iterations: int = 30
@@ -58,3 +63,198 @@ class SolveSummary:
     history: tuple[float, ...] = ()
     halvings: int = 0
     seconds: float = 0.0
+
+
+def solve_step(r: Array, J: Array) -> Array:
+    """Least-squares step (p,) by scaled normal equations; by the pseudo-inverse where they are singular."""
+    scale = np.linalg.norm(J, axis=0)
+    scale[scale == 0] = 1.0
+    scaled = J / scale
+    N, b = scaled.T @ scaled, scaled.T @ r
+    try:
+        factor = linalg.cho_factor(N, check_finite=False)
+        step = linalg.cho_solve(factor, b, check_finite=False)
+    except linalg.LinAlgError:
+        step = linalg.lstsq(scaled, r, cond=1e-12, check_finite=False)[0]
+    return np.asarray(step / scale)
+
+
+def gauss_newton(
+    linearise: Callable[[State], tuple[Array, Array]],
+    residuals: Callable[[State], Array],
+    retract: Callable[[State, Array], State],
+    start: State,
+    settings: TerminationSettings = TerminationSettings(),
+) -> tuple[State, SolveSummary]:
+    """Minimise ``|r|^2`` by Gauss-Newton steps, halved until the cost falls (thesis section 5.2).
+
+    Parameters
+    ----------
+    linearise : whitened residuals (m,) and Jacobian (m, p) at a state.
+    residuals : the residuals alone, for the line search.
+    retract : moves a state by a step (p,).
+    start : first state.
+    settings : termination.
+
+    Raises
+    ------
+    InvalidInput : the residuals at the start are not finite.
+    """
+    clock = time.perf_counter()
+    state, halvings = start, 0
+    r, J = linearise(state)
+    cost = 0.5 * float(r @ r)
+    if not np.isfinite(cost) or not np.all(np.isfinite(J)):
+        raise InvalidInput("the residuals at the start values are not finite: check measurements and covariances")
+    history = [cost]
+
+    def summary(converged: bool, why: str) -> SolveSummary:
+        seconds = time.perf_counter() - clock
+        return SolveSummary(converged, len(history) - 1, why, history[0], cost, tuple(history), halvings, seconds)
+
+    for _ in range(settings.max_iterations):
+        step = solve_step(r, J)
+        predicted = J @ step
+        promise = float(r @ predicted - 0.5 * predicted @ predicted)
+        small = settings.cost_tolerance * (1.0 + cost)
+        if promise <= small:
+            return state, summary(True, "a further step would not lower the cost")
+        length = 1.0
+        for _ in range(settings.max_halvings + 1):
+            candidate = retract(state, length * step)
+            trial = residuals(candidate)
+            new_cost = 0.5 * float(trial @ trial)
+            if np.isfinite(new_cost) and new_cost < cost:
+                break
+            length *= 0.5
+            halvings += 1
+        else:
+            near = promise <= 1e-6 * (1.0 + cost)
+            return state, summary(near, "no fraction of the step lowers the cost")
+        gained, state, cost = cost - new_cost, candidate, new_cost
+        history.append(cost)
+        if gained <= small and length == 1.0:
+            return state, summary(True, "the last step lowered the cost by less than the tolerance")
+        r, J = linearise(state)
+    return state, summary(False, f"stopped after {settings.max_iterations} iterations")
+
+
+@dataclass(frozen=True)
+class Eliminated:
+    """A parameter that the data cannot tell apart.
+
+    Attributes
+    ----------
+    name : of the parameter.
+    reason : 'no influence', 'dependent' (a combination of others does the same), or 'weak' (its sigma would exceed what
+        is plausible, so the data say nothing that was not known).
+    tied_to : change of other parameters that does the same as one unit of this one; empty for no influence.
+    sigma : standard deviation it would have with the others free (infinite where dependent).
+    """
+
+    name: str
+    reason: str
+    tied_to: Mapping[str, float]
+    sigma: float
+
+
+def split_dependent(
+    N: Array, names: Sequence[str], limits: Array | None = None, relative_pivot: float = RELATIVE_PIVOT
+) -> tuple[list[int], list[Eliminated]]:
+    """Walk through the parameters in the given order; keep those that the ones kept so far cannot replace.
+
+    Cholesky with elimination where a pivot vanishes (thesis section 5.3), here also where the pivot, the information
+    that is left, is too small for the plausible size of the parameter.
+
+    Parameters
+    ----------
+    N : normal matrix (p, p) of whitened columns, in order of preference.
+    names : names (p,).
+    limits : largest sigma (p,) worth keeping; None for no such limit.
+    relative_pivot : pivot over diagonal below which a column counts as dependent.
+
+    Returns
+    -------
+    kept : indices in the order given.
+    eliminated : the others with what they are tied to.
+    """
+    p = len(names)
+    diagonal = np.diag(N).copy()
+    largest = float(diagonal.max(initial=0.0))
+    scale = np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+    work = N / np.outer(scale, scale)
+    kept: list[int] = []
+    dropped: list[tuple[int, str, float]] = []
+    floor = np.zeros(p) if limits is None else 1.0 / (np.asarray(limits) * scale) ** 2
+    for k in range(p):
+        pivot = work[k, k]
+        if diagonal[k] <= 1e-30 * largest or diagonal[k] == 0.0:
+            dropped.append((k, "no influence", np.inf))
+            continue
+        if pivot <= relative_pivot:
+            dropped.append((k, "dependent", np.inf))
+            continue
+        if pivot < floor[k]:
+            dropped.append((k, "weak", float(1.0 / np.sqrt(pivot) / scale[k])))
+            continue
+        kept.append(k)
+        row = work[k, k + 1 :] / pivot
+        work[k + 1 :, k + 1 :] -= np.outer(work[k + 1 :, k], row)
+    eliminated = []
+    if dropped:
+        Nk = N[np.ix_(kept, kept)] / np.outer(scale[kept], scale[kept])
+        right = N[np.ix_(kept, [k for k, _, _ in dropped])] / scale[kept][:, None]
+        ties = linalg.lstsq(Nk, right, cond=1e-14)[0] if kept else np.zeros((0, len(dropped)))
+        for column, (k, reason, sigma) in enumerate(dropped):
+            share = ties[:, column] / scale[k]  # in units of column norms: comparable between metres and radians
+            strong = np.flatnonzero(np.abs(share) > 0.02 * max(1e-300, np.abs(share).max(initial=0.0)))
+            tied = {} if reason == "no influence" else {
+                names[kept[s]]: float(ties[s, column] / scale[kept[s]]) for s in strong
+            }
+            eliminated.append(Eliminated(names[k], reason, tied, sigma))
+    return kept, eliminated
+
+
+@dataclass(frozen=True)
+class LinearStatistics:
+    """What a whitened Jacobian tells about the estimate.
+
+    Attributes
+    ----------
+    cofactor : (p, p) inverse of the normal matrix: covariance for unit variance of the whitened residuals.
+    condition : of the Jacobian with columns of unit length.
+    condition_raw : of the Jacobian in SI units.
+    correlations : (p, p).
+    singular_values : of the Jacobian in SI units divided by sqrt(rows), largest first.
+    """
+
+    cofactor: Array
+    condition: float
+    condition_raw: float
+    correlations: Array
+    singular_values: Array
+
+
+def linear_statistics(J: Array) -> LinearStatistics:
+    """Cofactor matrix, condition numbers and correlations of a whitened Jacobian (m, p) of full column rank."""
+    scale = np.linalg.norm(J, axis=0)
+    if J.shape[1] == 0:
+        empty = np.zeros((0, 0))
+        return LinearStatistics(empty, 1.0, 1.0, empty, np.zeros(0))
+    R = linalg.qr(J / scale, mode="r", check_finite=False)[0][: J.shape[1]]
+    values = linalg.svdvals(R, check_finite=False)
+    inverse = linalg.solve_triangular(R, np.eye(len(R)), check_finite=False)
+    cofactor = (inverse @ inverse.T) / np.outer(scale, scale)
+    sigma = np.sqrt(np.diag(cofactor))
+    raw = linalg.svdvals(R * scale, check_finite=False)
+    return LinearStatistics(
+        cofactor, float(values[0] / values[-1]), float(raw[0] / raw[-1]), cofactor / np.outer(sigma, sigma),
+        raw / np.sqrt(len(J)),
+    )
+
+
+def global_test(cost: float, redundancy: int) -> tuple[float, float]:
+    """sigma0 and the p-value of a residual sum as large or larger (chi-square) if the stated covariance holds."""
+    if redundancy <= 0:
+        return 1.0, 1.0
+    return float(np.sqrt(2.0 * cost / redundancy)), float(stats.chi2.sf(2.0 * cost, redundancy))

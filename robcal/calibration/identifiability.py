@@ -1,0 +1,211 @@
+"""Which parameters to identify: order of preference, what is plausible, choice of elasticities by evidence, indices.
+
+Geometry: all deviations are candidates; those that others can replace, or that the data determine worse than anybody
+would doubt them anyway, are eliminated and named (:func:`robcal.least_squares.split_dependent`).
+Elasticities are taken up only where the data ask for them, by F-tests on the identification poses: a needless one costs
+accuracy at other poses, a missing one too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg, stats
+
+from robcal.errors import InvalidInput
+from robcal.robot.kernel import Kernel, PoseInputs
+from robcal.robot.model import ANGLE_OF_AXIS, ELASTIC_KINDS, GEOMETRIC_KINDS, RobotModel
+from robcal.robot.terms import identifier
+
+Array = NDArray[np.float64]
+
+PLAUSIBLE_LENGTH = 5e-3
+"""A length deviation (m) that the data determine worse than this is left at nominal."""
+PLAUSIBLE_ANGLE = 5e-3
+"""The same for angles (rad), and for what an elasticity turns its angle at the largest moment met."""
+
+OWN_AXIS_LEVEL = 0.05
+"""An elasticity about the joint's own axis stays unless its F-test gives a p-value above this: it is known to exist."""
+CROSS_AXIS_LEVEL = 0.01
+"""One across the axis enters only below this, divided by the number of candidates (Bonferroni)."""
+
+TABLE_5_4 = (
+    ("roll", "elastic_roll", "elastic_pitch"),
+    ("roll", "elastic_pitch", "pitch", "yaw", "x"),
+    ("roll", "elastic_roll", "elastic_pitch", "pitch", "yaw", "x"),
+    ("elastic_roll", "elastic_pitch", "yaw", "x", "z"),
+    ("elastic_pitch", "pitch", "yaw", "elastic_yaw", "y", "z"),
+    ("elastic_roll", "elastic_pitch", "pitch", "elastic_yaw", "yaw"),
+)
+"""The 30 parameters of the thesis' Table 5.4 by axis, for an arm with axes z, y, y, x, y, x."""
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Names in order of preference.
+
+    Attributes
+    ----------
+    forced : kept whenever the data can tell them apart: base, tool, geometry, terms.
+    own_axis, cross_axis : elasticities to be chosen by evidence; empty if the caller named the parameters.
+    """
+
+    forced: tuple[str, ...]
+    own_axis: tuple[str, ...] = ()
+    cross_axis: tuple[str, ...] = ()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """All of them, best first."""
+        return (*self.forced, *self.own_axis, *self.cross_axis)
+
+
+def choose_candidates(model: RobotModel, parameters: str | Sequence[str]) -> Candidates:
+    """Candidates of a choice 'standard', 'geometry', 'table5.4', or of named parameters.
+
+    Base and tool are always among them. Order of preference within the geometry: base, tool, the joints' zero offsets,
+    then frame by frame from the base; so what remains ambiguous is told in terms of the outer frames.
+
+    Raises
+    ------
+    InvalidInput : unknown choice or name, or Table 5.4 for another kind of arm.
+    """
+    ends = [f"{end}.{k}" for end in ("base", "tool") for k in GEOMETRIC_KINDS]
+    zeros = [f"{f.name}.{f.joint_kind}" for f in model.joints]
+    others = [f"{f.name}.{k}" for f in model.frames for k in GEOMETRIC_KINDS if f"{f.name}.{k}" not in zeros]
+    terms = list(dict.fromkeys(n for t in model.terms for n in t.parameter_names))
+    own = [f"{f.name}.elastic_{ANGLE_OF_AXIS[str(f.axis)]}" for f in model.joints if not f.prismatic]
+    cross = [f"{f.name}.{k}" for f in model.frames for k in ELASTIC_KINDS if f"{f.name}.{k}" not in own]
+    if parameters == "standard":
+        return Candidates((*ends, *zeros, *others, *terms), tuple(own), tuple(cross))
+    if parameters == "geometry":
+        return Candidates((*ends, *zeros, *others, *terms))
+    if parameters == "table5.4":
+        if [f.axis for f in model.joints] != ["z", "y", "y", "x", "y", "x"] or any(f.prismatic for f in model.joints):
+            raise InvalidInput(
+                "the set table5.4 is for arms with rotary axes z, y, y, x, y, x; choose standard for this robot"
+            )
+        table = [f"{f.name}.{k}" for f, kinds in zip(model.joints, TABLE_5_4, strict=True) for k in kinds]
+        return Candidates((*ends, *table, *terms))
+    if isinstance(parameters, str):
+        raise InvalidInput(f"parameters must be standard, geometry, table5.4 or a list of names, not '{parameters}'")
+    return Candidates(tuple(dict.fromkeys((*ends, *parameters, *terms))))
+
+
+def plausible_limits(kernel: Kernel, theta: Array, poses: PoseInputs, names: Sequence[str]) -> Array:
+    """Standard deviation (p,) above which a parameter is not worth identifying; infinite for terms and loads."""
+    variables = kernel.variables(theta, poses)
+    limits = np.full(len(names), np.inf)
+    frames = {f.name for f in kernel.model.frames}
+    for k, name in enumerate(names):
+        frame, _, kind = name.rpartition(".")
+        if frame not in frames:
+            continue
+        if kind in ("x", "y", "z"):
+            limits[k] = PLAUSIBLE_LENGTH
+        elif kind in ("roll", "pitch", "yaw"):
+            limits[k] = PLAUSIBLE_ANGLE
+        else:
+            moment = variables[f"{identifier(frame)}_m{kind.removeprefix('elastic_')}"]
+            limits[k] = PLAUSIBLE_ANGLE / max(float(np.abs(moment).max(initial=0.0)), 1e-9)
+    return limits
+
+
+@dataclass(frozen=True)
+class StepwiseChoice:
+    """Result of the choice by evidence.
+
+    Attributes
+    ----------
+    taken : indices (into the optional columns) that stay.
+    p_values : p-value of each optional column: of removing it if taken, of adding it if not.
+    """
+
+    taken: tuple[int, ...]
+    p_values: Array
+
+
+def choose_by_evidence(N: Array, b: Array, rest: float, rows: int, forced: int, n_own: int) -> StepwiseChoice:
+    """Backward and forward choice among optional columns by F-tests.
+
+    Parameters
+    ----------
+    N, b, rest : normal matrix (p, p), right side (p,) and sum of squares of a whitened linear problem whose columns are
+        forced ones first, then own-axis elasticities, then cross-axis ones; the residuals are those for all optional
+        parameters at zero.
+    rows : number of residuals; forced : number of forced columns; n_own : of own-axis ones.
+
+    Weakness: stepwise; of two columns that say nearly the same the one tested last stays.
+    """
+    p = len(b)
+    scale = np.sqrt(np.where(np.diag(N) > 0, np.diag(N), 1.0))
+    N, b = N / np.outer(scale, scale), b / scale
+    f = slice(0, forced)
+    solved = linalg.lstsq(N[f, f], np.column_stack([N[f, forced:], b[f]]), cond=1e-13)[0]
+    E = N[forced:, forced:] - N[forced:, f] @ solved[:, :-1]
+    c = b[forced:] - N[forced:, f] @ solved[:, -1]
+    rest = rest - float(b[f] @ solved[:, -1])
+    m = p - forced
+    alive = [k for k in range(m) if E[k, k] > 1e-10]
+
+    def fit(chosen: list[int]) -> tuple[float, Array]:
+        """Sum of squares and squared t numerators (drop of the sum by each) of a choice."""
+        if not chosen:
+            return rest, np.zeros(0)
+        inverse = np.linalg.inv(E[np.ix_(chosen, chosen)])
+        x = inverse @ c[chosen]
+        return rest - float(c[chosen] @ x), x**2 / np.diag(inverse)
+
+    def level(k: int) -> float:
+        n_cross = max(1, sum(1 for j in alive if j >= n_own))
+        return OWN_AXIS_LEVEL if k < n_own else CROSS_AXIS_LEVEL / n_cross
+
+    def p_value(drop: float, total: float, n_chosen: int) -> float:
+        freedom = rows - forced - n_chosen
+        return float(stats.f.sf(drop / (total / freedom), 1, freedom)) if freedom > 0 and total > 0 else 1.0
+
+    chosen = [k for k in alive if k < n_own]
+    for _ in range(4 * m + 4):
+        total, drops = fit(chosen)
+        worst = [(p_value(d, total, len(chosen)) / level(k), k) for d, k in zip(drops, chosen, strict=True)]
+        if worst and max(worst)[0] > 1.0:
+            chosen.remove(max(worst)[1])
+            continue
+        gains = []
+        for k in (k for k in alive if k not in chosen):
+            new_total, new_drops = fit([*chosen, k])
+            gains.append((p_value(float(new_drops[-1]), new_total, len(chosen) + 1) / level(k), k))
+        if gains and min(gains)[0] < 0.5:  # stricter than for staying, so that nothing goes round in circles
+            chosen.append(min(gains)[1])
+            continue
+        break
+    values = np.ones(m)
+    total, drops = fit(chosen)
+    for d, k in zip(drops, chosen, strict=True):
+        values[k] = p_value(d, total, len(chosen))
+    for k in (k for k in alive if k not in chosen):
+        new_total, new_drops = fit([*chosen, k])
+        values[k] = p_value(float(new_drops[-1]), new_total, len(chosen) + 1)
+    return StepwiseChoice(tuple(sorted(chosen)), values)
+
+
+def observability_indices(singular_values: Array) -> dict[str, float]:
+    """O1 to O5 of the singular values (largest first) of the identification Jacobian.
+
+    Source: Sun and Hollerbach (2008), "Observability index selection for robot calibration"; O1 after Borm and Menq,
+    O2 Driels and Pathre, O3 and O4 Nahvi and Hollerbach, O5 Sun and Hollerbach. The values are per row: the caller
+    divides by the root of the number of rows.
+    """
+    s = np.asarray(singular_values, dtype=float)
+    if len(s) == 0 or s[-1] <= 0:
+        return {"O1": 0.0, "O2": 0.0, "O3": 0.0, "O4": 0.0, "O5": 0.0}
+    return {
+        "O1": float(np.exp(np.mean(np.log(s)))),
+        "O2": float(s[-1] / s[0]),
+        "O3": float(s[-1]),
+        "O4": float(s[-1] ** 2 / s[0]),
+        "O5": float(1.0 / np.sum(1.0 / s)),
+    }
