@@ -1,0 +1,286 @@
+"""Targets of one image: find blobs, fit ellipses, read codes, refuse the rest with a reason."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robcal.errors import InvalidInput
+from robcal.imaging.aruco_markers import find_markers
+from robcal.imaging.detections import CodeState, Detections, Reason, RejectionLog, TargetKind, empty_columns
+from robcal.imaging.dot_fitting import FittedDots, blur_without_pixel, fit_dots, refit_coded
+from robcal.imaging.noise import NoiseModel, estimate_noise
+from robcal.imaging.ring_code import RingReadings, read_rings
+from robcal.imaging.segmentation import Candidates, find_candidates
+from robcal.imaging.settings import DetectionSettings
+
+Array = NDArray[np.float64]
+
+_DEFAULT = DetectionSettings()
+
+
+def detect_targets(image: NDArray, settings: DetectionSettings = _DEFAULT) -> Detections:
+    """Finds the targets of a grey image.
+
+    Parameters
+    ----------
+    image : (h, w) uint8 or uint16; not changed. settings : what to look for.
+
+    Returns
+    -------
+    Detections; empty with a message where there is nothing to see (black or evenly saturated image).
+
+    Raises
+    ------
+    InvalidInput : not a two-dimensional image of 8 or 16 bit, or an unknown marker dictionary.
+
+    Notes
+    -----
+    Weakness: a lamp or reflection that is a clean ellipse within the size limits is reported as an uncoded dot; only
+    geometry can tell later. Covariances hold for the centre of the dot's image ellipse, not for its eccentricity.
+    """
+    _check(image)
+    noise = estimate_noise(image)
+    log = RejectionLog()
+    message = _nothing_to_see(image, noise, settings)
+    if message:
+        return _detections(image, empty_columns(), noise, log, message)
+    bright, bright_noise = _bright(image, noise, settings)
+    saturation = saturation_level(bright) if settings.saturation_level is None else settings.saturation_level
+    if settings.polarity == "dark" and settings.saturation_level is not None:
+        saturation = np.iinfo(image.dtype).max - settings.saturation_level
+    candidates = find_candidates(bright, bright_noise, settings, log)
+    late = _may_be_ring_parts(candidates) if settings.ring12 else np.zeros(len(candidates), bool)
+    dots, bright_noise, _ = fit_dots(bright, candidates.take(~late), bright_noise, saturation)
+    dots = _accept(dots, bright, bright_noise, settings, log)
+    readings, dots = _read(bright, dots, bright_noise, saturation, settings)
+    waiting = _without_ring_parts(candidates.take(late), dots, readings, log)
+    if len(waiting):
+        more, _, _ = fit_dots(bright, waiting, bright_noise, saturation)
+        more = _accept(more, bright, bright_noise, settings, log)
+        dots, readings = _merged(bright, dots, readings, more, bright_noise, saturation, settings)
+    dots, readings = _without_duplicates(dots, readings, log)
+    columns = _columns(dots, readings, settings, np.iinfo(image.dtype).max)
+    if settings.aruco is not None:
+        markers = find_markers(image, settings.aruco, noise)
+        columns = {name: np.concatenate([columns[name], markers[name]]) for name in columns}
+    found = replace(noise, gain=abs(bright_noise.gain))
+    return _detections(image, columns, found, log, "" if len(columns["xy"]) else _no_target(log))
+
+
+def _check(image: NDArray) -> None:
+    if not isinstance(image, np.ndarray) or image.ndim != 2:
+        raise InvalidInput("the image must be a two-dimensional grey array; convert colour to grey first")
+    if image.dtype not in (np.uint8, np.uint16):
+        raise InvalidInput(f"the image has type {image.dtype}; give 8 or 16 bit unsigned grey values")
+    if min(image.shape) < 8:
+        raise InvalidInput(f"the image has {image.shape[1]} x {image.shape[0]} pixels; at least 8 x 8 are needed")
+
+
+def _nothing_to_see(image: NDArray, noise: NoiseModel, settings: DetectionSettings) -> str:
+    low, high = int(image.min()), int(image.max())
+    if high - low < max(settings.min_contrast_sigma * noise.sigma, 2.0 * noise.step):
+        where = "black" if high < 0.05 * np.iinfo(image.dtype).max else "evenly grey"
+        if low >= np.iinfo(image.dtype).max * 0.98:
+            where = "saturated everywhere"
+        return f"the image is {where} (grey values {low} to {high}): check exposure and lamp"
+    return ""
+
+
+def _no_target(log: RejectionLog) -> str:
+    counts = log.result().counts
+    if not counts:
+        return "nothing stands out from the background"
+    worst = sorted(counts, key=lambda reason: -counts[reason])[:3]
+    return "no dot among the candidates: " + ", ".join(f"{counts[reason]} {reason.value}" for reason in worst)
+
+
+def _bright(image: NDArray, noise: NoiseModel, settings: DetectionSettings) -> tuple[NDArray, NoiseModel]:
+    """The image with bright dots and its noise model; dark dots are turned over."""
+    if settings.polarity == "bright":
+        return image, noise
+    top = np.iinfo(image.dtype).max
+    # variance grows with the original brightness, so it falls in the turned one
+    return top - image, replace(noise, gain=-noise.gain, level=float(top) - noise.level)
+
+
+def saturation_level(image: NDArray) -> float:
+    """Grey value at which the image is cut off, infinity if none: the top of the range, or a plateau below it."""
+    top, high = int(np.iinfo(image.dtype).max), int(image.max())
+    if high == top:
+        return float(top)
+    plateau = int(np.count_nonzero(image == high))
+    step = max(1, (top + 1) >> 8)
+    below = int(np.count_nonzero(image >= max(high - step, 0))) - plateau
+    # free grey values thin out towards their maximum; a pile at the very maximum is a cut
+    return float(high) if plateau >= 12 and plateau > 4 * below else float("inf")
+
+
+def _may_be_ring_parts(candidates: Candidates) -> NDArray[np.bool_]:
+    """Blobs that lie wholly between 1.7 and 3.4 radii of a larger blob: fitted only if that is no coded dot."""
+    n = len(candidates)
+    result = np.zeros(n, bool)
+    if n < 2:
+        return result
+    area = np.prod(candidates.semi_axes, axis=1)
+    from scipy.spatial import cKDTree
+
+    tree = cKDTree(candidates.xy)
+    radius = 3.0 * candidates.semi_axes[:, 0]
+    for host, around in enumerate(tree.query_ball_point(candidates.xy, radius)):
+        others = np.array([k for k in around if k != host], dtype=int)
+        if others.size == 0:
+            continue
+        rho = _relative_radius(candidates.xy[others], candidates.xy[host], candidates.semi_axes[host], candidates.angle[host])
+        parts = (rho > 1.8) & (rho < 3.0) & (area[others] < 1.15 * area[host])
+        parts &= candidates.semi_axes[others, 1] < 0.85 * candidates.semi_axes[host, 0]
+        result[others[parts]] = True
+    return result
+
+
+def _relative_radius(xy: Array, centre: Array, semi_axes: Array, angle: float) -> Array:
+    """Distance from the centre of an ellipse in units of its radius."""
+    c, s = np.cos(angle), np.sin(angle)
+    d = xy - centre
+    return np.hypot((c * d[:, 0] + s * d[:, 1]) / semi_axes[0], (-s * d[:, 0] + c * d[:, 1]) / semi_axes[1])
+
+
+def _accept(
+    dots: FittedDots, image: NDArray, noise: NoiseModel, settings: DetectionSettings, log: RejectionLog
+) -> FittedDots:
+    """The fits that are dots; the others go to the log."""
+    n = len(dots)
+    if n == 0:
+        return dots
+    height, width = image.shape
+    sigma = np.sqrt(noise.at(dots.background))
+    reach = dots.semi_axes[:, 0] + 1.0
+    x, y = dots.xy.T
+    tests = (
+        (Reason.NO_CONVERGENCE, ~dots.converged | ~np.isfinite(dots.covariance).all(axis=(1, 2))),
+        (Reason.BORDER, (x < reach) | (y < reach) | (x > width - 1 - reach) | (y > height - 1 - reach)),
+        (Reason.CONTRAST, dots.contrast < settings.min_contrast_sigma * sigma),
+        (Reason.TOO_SMALL, ~dots.is_spot & (dots.semi_axes[:, 1] < settings.min_axis_px)),
+        (Reason.TOO_LARGE, dots.semi_axes[:, 0] > settings.max_axis_px),
+        (Reason.ELONGATED, dots.semi_axes[:, 1] < settings.min_axis_ratio * dots.semi_axes[:, 0]),
+        (Reason.STRUCTURE, dots.misfit > settings.max_misfit),
+        # an edge as soft as the dot is large: glare, a reflection out of focus
+        (Reason.STRUCTURE, ~dots.is_spot & (dots.s > 0.8 * dots.semi_axes[:, 1] + 0.5)),
+    )
+    good = np.ones(n, bool)
+    for reason, bad in tests:
+        for row in np.flatnonzero(good & bad):
+            log.add(*dots.xy[row], dots.semi_axes[row, 0], reason)
+        good &= ~bad
+    return dots.take(good)
+
+
+def _read(
+    image: NDArray, dots: FittedDots, noise: NoiseModel, saturation: float, settings: DetectionSettings
+) -> tuple[RingReadings, FittedDots]:
+    """Readings of all dots; those with a code are fitted again without their ring's glare."""
+    readings = _readings(image, dots, noise, saturation, settings)
+    coded = np.flatnonzero(readings.code >= 0)
+    if coded.size:
+        again = refit_coded(image, dots, readings, coded, noise, saturation)
+        good = again.converged & (np.linalg.norm(again.xy - dots.xy[coded], axis=1) < 0.5) & ~again.is_spot
+        dots = dots.replaced(coded[good], again.take(good))
+    return readings, dots
+
+
+def _readings(
+    image: NDArray, dots: FittedDots, noise: NoiseModel, saturation: float, settings: DetectionSettings
+) -> RingReadings:
+    n = len(dots)
+    if not settings.ring12 or n == 0:
+        none = np.zeros(n, bool)
+        return RingReadings(np.full(n, -1, np.int64), none, np.zeros(n), np.zeros((n, 12), bool), np.zeros(n))
+    sigma = np.sqrt(noise.at(dots.background + 0.5 * dots.contrast))
+    return read_rings(
+        image, dots.xy, dots.b, dots.s, dots.background, dots.contrast, sigma, saturation, settings.known_codes
+    )
+
+
+def _without_ring_parts(
+    candidates: Candidates, dots: FittedDots, readings: RingReadings, log: RejectionLog
+) -> Candidates:
+    """The late candidates that are not part of a ring around an accepted dot, read or not."""
+    keep = np.ones(len(candidates), bool)
+    for host in np.flatnonzero(readings.evidence):
+        rho = _relative_radius(candidates.xy, dots.xy[host], dots.semi_axes[host], float(dots.angle[host]))
+        # a segment lies between 2 and 3; an uncoded dot of the same size would reach out of that band
+        keep &= ~((rho > 1.8) & (rho < 3.2))
+    for row in np.flatnonzero(~keep):
+        log.add(*candidates.xy[row], candidates.semi_axes[row, 0], Reason.RING_PART)
+    return candidates.take(keep)
+
+
+def _merged(
+    image: NDArray, dots: FittedDots, readings: RingReadings, more: FittedDots, noise: NoiseModel, saturation: float,
+    settings: DetectionSettings,
+) -> tuple[FittedDots, RingReadings]:  # fmt: skip
+    new = _readings(image, more, noise, saturation, settings)
+    # what waited because it may be part of a ring carries no code of its own
+    new = replace(new, code=np.full(len(more), -1, np.int64))
+    joined = FittedDots(
+        *(np.concatenate([getattr(dots, f), getattr(more, f)]) for f in FittedDots.__dataclass_fields__)
+    )
+    both = RingReadings(
+        *(np.concatenate([getattr(readings, f), getattr(new, f)]) for f in RingReadings.__dataclass_fields__)
+    )
+    return joined, both
+
+
+def _without_duplicates(
+    dots: FittedDots, readings: RingReadings, log: RejectionLog
+) -> tuple[FittedDots, RingReadings]:
+    """One dot per place: of overlapping ones the coded, then the better fitting one; no dot inside a read ring."""
+    n = len(dots)
+    if n < 2:
+        return dots, readings
+    from scipy.spatial import cKDTree
+
+    order = np.lexsort((dots.misfit + dots.residual, readings.code < 0))
+    tree = cKDTree(dots.xy)
+    keep = np.ones(n, bool)
+    reach = np.where(readings.code >= 0, 3.1, 0.9) * dots.semi_axes[:, 0]
+    for row in order:
+        if not keep[row]:
+            continue
+        for other in tree.query_ball_point(dots.xy[row], reach[row]):
+            if other == row or not keep[other]:
+                continue
+            rho = _relative_radius(
+                dots.xy[other : other + 1], dots.xy[row], dots.semi_axes[row], float(dots.angle[row])
+            )[0]
+            ring = readings.code[row] >= 0 and rho < 3.05
+            if rho < 0.9 or (ring and readings.code[other] < 0):
+                keep[other] = False
+                log.add(*dots.xy[other], dots.semi_axes[other, 0], Reason.RING_PART if ring else Reason.DUPLICATE)
+    kept = RingReadings(*(getattr(readings, f)[keep] for f in RingReadings.__dataclass_fields__))
+    return dots.take(keep), kept
+
+
+def _columns(dots: FittedDots, readings: RingReadings, settings: DetectionSettings, top: int) -> dict[str, NDArray]:
+    n = len(dots)
+    dark = settings.polarity == "dark"
+    state = np.where(readings.code >= 0, CodeState.READ, np.where(readings.evidence, CodeState.UNREADABLE, CodeState.NONE))
+    return {
+        "xy": dots.xy, "covariance": dots.covariance, "semi_axes": dots.semi_axes, "angle": dots.angle,
+        "contrast": -dots.contrast if dark else dots.contrast,
+        "background": top - dots.background if dark else dots.background, "saturated": dots.saturated,
+        "code": readings.code.astype(np.int64),
+        "kind": np.where(readings.code >= 0, TargetKind.RING12, TargetKind.DOT).astype(np.int8) if n else np.zeros(0, np.int8),
+        "code_state": np.asarray(state, dtype=np.int8), "blur": blur_without_pixel(dots.s), "residual": dots.residual,
+        "chi2": dots.chi2, "gain_gradient": dots.gain_gradient,
+    }  # fmt: skip
+
+
+def _detections(
+    image: NDArray, columns: dict[str, NDArray], noise: NoiseModel, log: RejectionLog, message: str
+) -> Detections:
+    return Detections(
+        shape=(int(image.shape[0]), int(image.shape[1])), noise=noise, rejected=log.result(), message=message, **columns
+    )

@@ -1,0 +1,262 @@
+"""From candidates to fitted dots: the ellipse fits of an image with what all its dots tell together.
+
+Two rounds. The first fits every dot by itself. Then all dots together say how the noise grows with brightness and how
+strong gain gradients are in this image; the second round uses both, leaves out single outlying pixels and replaces the
+edge model by a Gaussian spot where the dot is not larger than its blur.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robcal.imaging.edge_model import axes_from_matrix, matrix_from_axes
+from robcal.imaging.ellipse_fit import EllipseFits, evaluate, free_shading, iterate, outliers, start
+from robcal.imaging.noise import NoiseModel, with_gain
+from robcal.imaging.ring_code import RingReadings, ring_glare
+from robcal.imaging.segmentation import Candidates
+from robcal.imaging.windows import Windows, gather_windows
+
+Array = NDArray[np.float64]
+
+_PIXEL_VARIANCE = 1.0 / 12.0
+# systematic part of the centre that no noise covers (model misfit, pixel response), px; see edge_model
+_FLOOR_EDGE, _FLOOR_SPOT = 0.002, 0.008
+_SPOT_RATIO, _SPOT_RATIO_ROUND = 1.7, 1.2  # minor semi-axis by s below which a tilted, a round dot is a spot
+
+
+@dataclass(frozen=True)
+class FittedDots:
+    """Fits of n candidates in columns.
+
+    Attributes
+    ----------
+    xy (n, 2), covariance (n, 2, 2), b (n, 3) ellipse matrix, semi_axes (n, 2), angle (n,), s (n,) blur with the
+    pixel's part, background (n,), contrast (n,), gain_gradient (n, 2) per px, chi2 (n,), misfit (n,) RMS residual
+    beyond noise by contrast, residual (n,) RMS residual by contrast, saturated (n,), converged (n,), is_spot (n,),
+    shading_sigma (n,) prior used.
+    """
+
+    xy: Array
+    covariance: Array
+    b: Array
+    semi_axes: Array
+    angle: Array
+    s: Array
+    background: Array
+    contrast: Array
+    gain_gradient: Array
+    chi2: Array
+    misfit: Array
+    residual: Array
+    saturated: NDArray[np.bool_]
+    converged: NDArray[np.bool_]
+    is_spot: NDArray[np.bool_]
+    shading_sigma: Array
+
+    def __len__(self) -> int:
+        return len(self.xy)
+
+    def take(self, chosen: NDArray) -> FittedDots:
+        """The chosen rows."""
+        return FittedDots(*(getattr(self, name)[chosen] for name in FittedDots.__dataclass_fields__))
+
+    def replaced(self, rows: NDArray, other: FittedDots) -> FittedDots:
+        """A copy with `rows` taken from `other`."""
+        columns = {}
+        for name in FittedDots.__dataclass_fields__:
+            column = getattr(self, name).copy()
+            column[rows] = getattr(other, name)
+            columns[name] = column
+        return FittedDots(**columns)
+
+    def as_candidates(self) -> Candidates:
+        """The fits as starts for another fit."""
+        blur = np.maximum(self.s, 0.3)
+        return Candidates(
+            self.xy, self.semi_axes, self.angle, self.background, self.background + self.contrast, blur
+        )
+
+
+def fit_dots(
+    image: NDArray, candidates: Candidates, noise: NoiseModel, saturation: float
+) -> tuple[FittedDots, NoiseModel, float]:
+    """Fits all candidates; also returns the noise model improved by them and the prior sigma of gain gradients.
+
+    Parameters
+    ----------
+    image : (h, w), bright dots. candidates : starts. noise : estimated from the image. saturation : grey value.
+    """
+    groups = gather_windows(image, candidates, saturation)
+    fits = [iterate(_start(candidates, window), window, noise, 12, tolerance=0.2) for window in groups]
+    noise = _noise_inside(groups, fits, noise)
+    shading, prior = _shading(groups, fits)
+    results = []
+    for window, fit in zip(groups, fits, strict=True):
+        results.append(_finish(fit, window, noise, shading[window.index], candidates))
+    return _join(results, groups, len(candidates)), noise, prior
+
+
+def refit_coded(
+    image: NDArray, dots: FittedDots, readings: RingReadings, rows: NDArray, noise: NoiseModel, saturation: float
+) -> FittedDots:
+    """Fits the coded dots `rows` again with the glare of their own ring taken off; the ring blurs into the gap."""
+    candidates = dots.take(rows).as_candidates()
+    groups = gather_windows(image, candidates, saturation, neighbours=False)
+    results = []
+    for window in groups:
+        source = rows[window.index]
+        glare = ring_glare(dots.xy[source], dots.b[source], dots.s[source], readings, source, window.x, window.y)
+        # foreign light in the window that the code does not explain
+        background, contrast = dots.background[source][:, None], dots.contrast[source][:, None]
+        clean = replace(window, value=window.value - glare * contrast, valid=window.valid & (glare < 0.12))
+        far = np.hypot(window.x - dots.xy[source][:, :1], window.y - dots.xy[source][:, 1:]) > (
+            dots.semi_axes[source][:, :1] + 2.0 * dots.s[source][:, None] + 0.7
+        )
+        clean = replace(clean, valid=clean.valid & ~(far & (clean.value > background + 0.2 * contrast)))
+        fit = iterate(_start(candidates, clean), clean, noise, 6, tolerance=0.1)
+        results.append(_finish(fit, clean, noise, dots.shading_sigma[source], candidates))
+    return _join(results, groups, len(rows))
+
+
+def _start(candidates: Candidates, window: Windows) -> EllipseFits:
+    rows = window.index
+    s = np.sqrt(np.maximum(candidates.blur[rows], 0.3) ** 2)
+    shape = np.column_stack([
+        candidates.xy[rows], matrix_from_axes(candidates.semi_axes[rows], candidates.angle[rows]), np.log(s)
+    ])  # fmt: skip
+    return start(shape, candidates.base[rows], candidates.peak[rows], window, np.zeros(len(rows), bool))
+
+
+def _noise_inside(groups: list[Windows], fits: list[EllipseFits], noise: NoiseModel) -> NoiseModel:
+    """The noise model with the gain seen inside the dots, where enough pixels lie well inside."""
+    grey, variance = [], []
+    for window, fit in zip(groups, fits, strict=True):
+        inside = window.inside & (fit.weight > 0)
+        use = np.flatnonzero(fit.converged & (inside.sum(axis=1) >= 12))
+        if use.size == 0:
+            continue
+        count = inside[use].sum(axis=1)
+        squares = np.where(inside[use], fit.residual[use] ** 2, 0.0).sum(axis=1)
+        mean = np.where(inside[use], window.value[use], 0.0).sum(axis=1) / count
+        # one to three parameters (contrast and its gradient) are taken from these pixels
+        variance.append(squares / (count - 1.0 - 2.0 * (fit.shading_sigma[use] > 0)))
+        grey.append(mean)
+    if not grey:
+        return noise
+    return with_gain(noise, np.concatenate(grey), np.concatenate(variance))
+
+
+def _shading(groups: list[Windows], fits: list[EllipseFits]) -> tuple[Array, float]:
+    """Prior sigma of each dot's relative gain gradient per radius, (n,), and the common one of the image."""
+    n = sum(len(window.index) for window in groups)
+    square, variance, good = np.zeros(n), np.ones(n), np.zeros(n, bool)
+    for window, fit in zip(groups, fits, strict=True):
+        gradient, expected = free_shading(fit)
+        dof = np.maximum((fit.weight > 0).sum(axis=1) - 10, 1)
+        chi2 = np.einsum("np,np,np->n", fit.weight, fit.residual, fit.residual) / dof
+        square[window.index] = 0.5 * (gradient**2).sum(axis=1)
+        variance[window.index] = expected * np.maximum(chi2, 1.0)
+        good[window.index] = fit.converged & (chi2 < 50.0)
+    common = 0.0
+    if good.any():
+        s, v = square[good], variance[good]
+        keep = s <= np.quantile(s, 0.95) if len(s) >= 20 else np.ones(len(s), bool)
+        for _ in range(8):
+            weight = 1.0 / (v[keep] + common) ** 2
+            common = max(0.0, float((weight * (s[keep] - v[keep])).sum() / weight.sum()))
+    # a single dot with a gradient beyond what is usual here (99.9 % of two normal numbers) is left free
+    unusual = square > 6.9 * (variance + common)
+    return np.sqrt(np.where(unusual, square, common)), float(np.sqrt(common))
+
+
+def _finish(fit: EllipseFits, window: Windows, noise: NoiseModel, shading: Array, candidates: Candidates) -> dict:
+    """Second round on one group, and its results as columns."""
+    prior_blur = np.log(np.maximum(candidates.blur[window.index], 0.3))
+    fit = iterate(replace(fit, shading_sigma=shading), window, noise, 12, tolerance=0.05, prior_blur=prior_blur)
+    dropped = outliers(fit, window)
+    if dropped.any():
+        fit = iterate(fit, window, noise, 6, tolerance=0.05, dropped=dropped, prior_blur=prior_blur)
+    semi_axes, _ = axes_from_matrix(fit.parameters[:, 2:5])
+    ratio = semi_axes[:, 1] / np.exp(fit.parameters[:, 5])
+    tiny = (ratio < _SPOT_RATIO_ROUND) | ((ratio < _SPOT_RATIO) & (semi_axes[:, 1] < 0.85 * semi_axes[:, 0]))
+    if tiny.any():
+        fit = _as_spots(fit, window, noise, np.flatnonzero(tiny), prior_blur, dropped)
+    return _columns(fit, window, noise)
+
+
+def _as_spots(
+    fit: EllipseFits, window: Windows, noise: NoiseModel, rows: NDArray, prior_blur: Array, dropped: NDArray
+) -> EllipseFits:
+    """Replaces the fits of `rows` by Gaussian spots of the same second moments."""
+    chosen = Windows(*(getattr(window, name)[rows] for name in Windows.__dataclass_fields__))
+    old = EllipseFits(*(getattr(fit, name)[rows] for name in EllipseFits.__dataclass_fields__))
+    semi_axes, angle = axes_from_matrix(old.parameters[:, 2:5])
+    parameters = old.parameters.copy()
+    second = np.sqrt(np.exp(2.0 * parameters[:, 5, None]) + semi_axes**2 / 4.0)
+    parameters[:, 2:5] = matrix_from_axes(second, angle)
+    spots = replace(old, parameters=parameters, is_spot=np.ones(len(rows), bool))
+    spots = iterate(spots, chosen, noise, 15, 0.05, dropped[rows], prior_blur[rows])
+    columns = {}
+    for name in EllipseFits.__dataclass_fields__:
+        column = getattr(fit, name).copy()
+        column[rows] = getattr(spots, name)
+        columns[name] = column
+    return EllipseFits(**columns)
+
+
+def _columns(fit: EllipseFits, window: Windows, noise: NoiseModel) -> dict:
+    parameters = fit.parameters
+    inverse = fit.covariance()
+    used = (fit.weight > 0).sum(axis=1)
+    dof = np.maximum(used - 10, 1)
+    chi2 = np.einsum("np,np,np->n", fit.weight, fit.residual, fit.residual) / dof
+    mean_square = np.where(fit.weight > 0, fit.residual**2, 0.0).sum(axis=1) / dof
+    expected = np.where(fit.weight > 0, 1.0 / np.maximum(fit.weight, 1e-30), 0.0).sum(axis=1) / np.maximum(used, 1)
+    contrast = parameters[:, 9]
+    safe = np.maximum(np.abs(contrast), 1e-6)
+    # beyond its own scatter chi2 tells of misfit or underestimated noise; correlated noise counts by its block means
+    excess = np.where(chi2 > 1.0 + 3.0 * np.sqrt(2.0 / dof), chi2, 1.0)
+    covariance = inverse[:, :2, :2] * np.maximum(excess, noise.correlation)[:, None, None]
+    floor = np.where(fit.is_spot, _FLOOR_SPOT, _FLOOR_EDGE)
+    covariance = covariance + floor[:, None, None] ** 2 * np.eye(2)
+    s = np.exp(parameters[:, 5])
+    semi_axes, angle = axes_from_matrix(parameters[:, 2:5])
+    return {
+        "xy": parameters[:, :2], "covariance": covariance, "b": parameters[:, 2:5], "semi_axes": semi_axes,
+        "angle": angle, "s": s, "background": parameters[:, 6], "contrast": contrast,
+        "gain_gradient": parameters[:, 10:12] / (safe * window.radius)[:, None], "chi2": chi2,
+        "misfit": np.sqrt(np.maximum(mean_square - expected, 0.0)) / safe, "residual": np.sqrt(mean_square) / safe,
+        "saturated": (window.saturated & window.valid).any(axis=1), "converged": fit.converged & (used > 12),
+        "is_spot": fit.is_spot, "shading_sigma": fit.shading_sigma,
+    }  # fmt: skip
+
+
+def _join(results: list[dict], groups: list[Windows], n: int) -> FittedDots:
+    """Columns of all groups in the order of the candidates; axes of spots by the blur of the others."""
+    if not results:
+        return FittedDots(
+            np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros((0, 3)), np.zeros((0, 2)), *(np.zeros(0) for _ in range(4)),
+            np.zeros((0, 2)), *(np.zeros(0) for _ in range(3)), *(np.zeros(0, bool) for _ in range(3)), np.zeros(0),
+        )  # fmt: skip
+    order = np.argsort(np.concatenate([window.index for window in groups]))
+    columns = {name: np.concatenate([result[name] for result in results])[order] for name in results[0]}
+    spots = columns["is_spot"]
+    if spots.any():
+        edges = ~spots & columns["converged"]
+        s = float(np.median(columns["s"][edges])) if edges.any() else 0.6
+        # second moments of a disc: a quarter of the squared semi-axes
+        axes = 2.0 * np.sqrt(np.maximum(columns["semi_axes"][spots] ** 2 - s**2, 0.15**2))
+        columns["semi_axes"][spots], columns["s"][spots] = axes, s
+        columns["b"][spots] = matrix_from_axes(axes, columns["angle"][spots])
+    return FittedDots(**columns)
+
+
+def blur_without_pixel(s: Array) -> Array:
+    """Standard deviation of the lens's blur from that of the edge profile."""
+    return np.sqrt(np.maximum(s**2 - _PIXEL_VARIANCE, 0.0))
+
+
+__all__ = ["FittedDots", "blur_without_pixel", "evaluate", "fit_dots", "refit_coded"]

@@ -1,0 +1,267 @@
+"""Least-squares fit of blurred ellipses to grey values, all ellipses of a group at once.
+
+Grey value = b0 + b1 x + b2 y + (g0 + g1 x + g2 y) E(x, y): background plane, contrast with a linear gain gradient,
+step profile E of :mod:`robcal.imaging.edge_model`. x, y in the linear terms count from the window's fixed origin in
+units of the dot's radius. The gain gradient costs precision (it looks like a shift of the edge), so it carries a
+normal prior of zero mean whose variance is estimated from all dots of the image (empirical Bayes): no shading, no
+cost; shading, no bias. Saturated pixels are censored: they only say that the value is at least the saturation level.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robcal.imaging.edge_model import SHAPE_PARAMETERS, blurred_ellipse, spot
+from robcal.imaging.noise import NoiseModel
+from robcal.imaging.windows import Windows
+
+Array = NDArray[np.float64]
+
+PARAMETERS = SHAPE_PARAMETERS + 6  # b0, b1, b2, g0, g1, g2
+_LN_BLUR_SIGMA = 1.0  # weak prior on ln s: keeps dots of two pixels from an edge sharper or softer than can be
+_OUTLIER_SIGMA = 6.0
+_SHADING_SIGMA_MIN = 1e-3  # per radius; keeps the prior finite
+
+
+@dataclass(frozen=True)
+class EllipseFits:
+    """State of n fits.
+
+    Attributes
+    ----------
+    parameters : (n, 12) cx, cy, B11, B12, B22, ln s, b0, b1, b2, g0, g1, g2.
+    normal : (n, 12, 12) normal matrices with priors, in the metric of the stated noise.
+    cost : (n,) weighted sum of squares with priors. converged : (n,) bool. is_spot : (n,) bool.
+    weight : (n, p) used last, zero for pixels without information. residual : (n, p) grey values.
+    shading_sigma : (n,) prior sigma of g1 / g0 and g2 / g0 per radius.
+    """
+
+    parameters: Array
+    normal: Array
+    cost: Array
+    converged: NDArray[np.bool_]
+    is_spot: NDArray[np.bool_]
+    weight: Array
+    residual: Array
+    shading_sigma: Array
+
+    def covariance(self) -> Array:
+        """(n, 12, 12) inverse of the normal matrices; infinite centre variances where they are singular."""
+        scale = 1.0 / np.sqrt(np.maximum(np.diagonal(self.normal, axis1=1, axis2=2), 1e-300))
+        scaled = self.normal * scale[:, :, None] * scale[:, None, :]
+        values, vectors = np.linalg.eigh(scaled)
+        singular = values[:, 0] < 1e-12
+        inverse = np.einsum("nij,nj,nkj->nik", vectors, 1.0 / np.maximum(values, 1e-12), vectors)
+        inverse *= scale[:, :, None] * scale[:, None, :]
+        inverse[singular] = np.diag(np.full(PARAMETERS, np.inf))
+        return inverse
+
+
+def evaluate(parameters: Array, windows: Windows, is_spot: NDArray[np.bool_]) -> tuple[Array, Array]:
+    """Model grey values (n, p) and their derivatives (n, p, 12)."""
+    shape = parameters[:, :SHAPE_PARAMETERS]
+    profile, by_shape = blurred_ellipse(shape, windows.x, windows.y)
+    if is_spot.any():
+        profile[is_spot], by_shape[is_spot] = spot(shape[is_spot], windows.x[is_spot], windows.y[is_spot])
+    origin = _origin(windows)
+    x = (windows.x - origin[:, 0, None]) / windows.radius[:, None]
+    y = (windows.y - origin[:, 1, None]) / windows.radius[:, None]
+    b0, b1, b2, g0, g1, g2 = (parameters[:, SHAPE_PARAMETERS + k, None] for k in range(6))
+    gain = g0 + g1 * x + g2 * y
+    jacobian = np.empty((*x.shape, PARAMETERS))
+    np.multiply(by_shape, gain[..., None], out=jacobian[..., :SHAPE_PARAMETERS])
+    jacobian[..., 6] = 1.0
+    jacobian[..., 7] = x
+    jacobian[..., 8] = y
+    jacobian[..., 9] = profile
+    jacobian[..., 10] = profile * x
+    jacobian[..., 11] = profile * y
+    return b0 + b1 * x + b2 * y + gain * profile, jacobian
+
+
+def _origin(windows: Windows) -> Array:
+    """(n, 2) fixed origin of the linear terms: the first valid pixels' mean is stable under refits."""
+    count = np.maximum(windows.valid.sum(axis=1), 1)
+    return np.stack([
+        np.where(windows.valid, windows.x, 0.0).sum(axis=1) / count,
+        np.where(windows.valid, windows.y, 0.0).sum(axis=1) / count,
+    ], axis=-1)  # fmt: skip
+
+
+def start(shape: Array, base: Array, peak: Array, windows: Windows, is_spot: NDArray[np.bool_]) -> EllipseFits:
+    """Fits before their first step, from (n, 6) shapes and grey levels below and at the top of the blobs."""
+    n = len(shape)
+    parameters = np.zeros((n, PARAMETERS))
+    parameters[:, :SHAPE_PARAMETERS] = shape
+    parameters[:, 6], parameters[:, 9] = base, peak - base
+    zeros = np.zeros(windows.x.shape)
+    return EllipseFits(
+        parameters, np.zeros((n, PARAMETERS, PARAMETERS)), np.full(n, np.inf), np.zeros(n, bool), is_spot, zeros, zeros,
+        np.zeros(n),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _System:
+    normal: Array
+    right: Array
+    cost: Array
+    weight: Array
+    residual: Array
+
+
+def _system(
+    parameters: Array, prior_blur: Array, windows: Windows, fits: EllipseFits, noise: NoiseModel, dropped: NDArray
+) -> _System:
+    """Normal equations with priors at the given parameters."""
+    model, jacobian = evaluate(parameters, windows, fits.is_spot)
+    residual = windows.value - model
+    variance = noise.at(model)
+    # censored: a saturated pixel below whose level the model stays is a residual, above it none
+    silent = ~windows.valid | dropped | (windows.saturated & (residual < 0))
+    weight = np.where(silent, 0.0, 1.0 / variance)
+    weighted = jacobian * weight[..., None]
+    normal = np.matmul(weighted.transpose(0, 2, 1), jacobian)
+    right = np.einsum("npk,np->nk", weighted, residual)
+    cost = np.einsum("np,np,np->n", weight, residual, residual)
+    # priors
+    blur_precision = 1.0 / _LN_BLUR_SIGMA**2
+    offset = prior_blur - parameters[:, 5]
+    normal[:, 5, 5] += blur_precision
+    right[:, 5] += blur_precision * offset
+    cost = cost + blur_precision * offset**2
+    contrast = np.abs(parameters[:, 9])
+    sigma = np.maximum(fits.shading_sigma, _SHADING_SIGMA_MIN) * np.maximum(contrast, 1e-3)
+    for k in (10, 11):
+        normal[:, k, k] += 1.0 / sigma**2
+        right[:, k] -= parameters[:, k] / sigma**2
+        cost = cost + (parameters[:, k] / sigma) ** 2
+    # a contrast that only censored pixels know stays finite
+    normal[:, 9, 9] += 1e-4 / np.maximum(contrast, 1.0) ** 2
+    return _System(normal, right, cost, weight, residual)
+
+
+def iterate(
+    fits: EllipseFits, windows: Windows, noise: NoiseModel, steps: int, tolerance: float = 0.02,
+    dropped: NDArray[np.bool_] | None = None, prior_blur: Array | None = None,
+) -> EllipseFits:  # fmt: skip
+    """Levenberg-Marquardt steps on all fits that have not converged.
+
+    Parameters
+    ----------
+    steps : at most. tolerance : converged when a step moves the centre less than this part of its sigma.
+    dropped : (n, p) pixels left out as outliers. prior_blur : (n,) ln s of the weak prior, default the start's.
+    """
+    n = len(fits.parameters)
+    if n == 0:
+        return fits
+    dropped = np.zeros(windows.valid.shape, bool) if dropped is None else dropped
+    prior = fits.parameters[:, 5].copy() if prior_blur is None else prior_blur
+    parameters = fits.parameters.copy()
+    system = _system(parameters, prior, windows, fits, noise, dropped)
+    normal, right, cost = system.normal.copy(), system.right.copy(), system.cost.copy()
+    weight, residual = system.weight.copy(), system.residual.copy()
+    damping = np.full(n, 1e-4)
+    converged = np.zeros(n, bool)
+    active = np.arange(n)
+    for _ in range(steps):
+        step = _solve(normal[active], right[active], damping[active], fits.is_spot[active])
+        # a step is never larger than a part of the dot
+        size = windows.radius[active] + 1.0
+        factor = np.minimum(1.0, 0.3 * size / np.maximum(np.hypot(step[:, 0], step[:, 1]), 1e-12))
+        factor = np.minimum(factor, 0.7 / np.maximum(np.abs(step[:, 5]), 1e-12))
+        b_norm = np.abs(parameters[active, 2]) + np.abs(parameters[active, 4])
+        factor = np.minimum(factor, 0.4 * b_norm / np.maximum(np.abs(step[:, 2:5]).sum(axis=1), 1e-12))
+        step *= factor[:, None]
+        trial = parameters[active] + step
+        trial[:, 5] = np.clip(trial[:, 5], np.log(0.28), np.log(np.maximum(windows.radius[active], 1.0) * 2.0))
+        definite = (trial[:, 2] * trial[:, 4] > trial[:, 3] ** 2) & (trial[:, 2] > 0) & np.isfinite(trial).all(axis=1)
+        trial[~definite] = parameters[active[~definite]]
+        sub = _take(windows, active)
+        new = _system(trial, prior[active], sub, _take_fits(fits, active), noise, dropped[active])
+        # weights follow the model: compare both costs by the new weights within the noise of that change
+        better = definite & (new.cost <= cost[active] * (1 + 1e-9) + 1e-9)
+        accepted = active[better]
+        parameters[accepted] = trial[better]
+        normal[accepted], right[accepted], cost[accepted] = new.normal[better], new.right[better], new.cost[better]
+        weight[accepted], residual[accepted] = new.weight[better], new.residual[better]
+        damping[accepted] *= 0.1
+        damping[active[~better]] = np.maximum(damping[active[~better]] * 20.0, 1e-3)
+        # N step squared is the move in units of sigma
+        move = np.einsum("ni,nij,nj->n", step, normal[active], step)
+        done = (better & (move < tolerance**2)) | (~better & (damping[active] > 1e4)) | (~better & (move < tolerance**2))
+        converged[active[done]] = True
+        active = active[~done]
+        if active.size == 0:
+            break
+    return replace(
+        fits, parameters=parameters, normal=normal, cost=cost, converged=converged, weight=weight, residual=residual
+    )
+
+
+def _solve(normal: Array, right: Array, damping: Array, is_spot: NDArray[np.bool_]) -> Array:
+    diagonal = np.maximum(np.diagonal(normal, axis1=1, axis2=2), 1e-300)
+    scale = 1.0 / np.sqrt(diagonal)
+    scaled = normal * scale[:, :, None] * scale[:, None, :]
+    scaled[:, np.arange(PARAMETERS), np.arange(PARAMETERS)] = 1.0 + np.maximum(damping, 1e-10)[:, None]
+    step = np.linalg.solve(scaled, (right * scale)[..., None])[..., 0] * scale
+    step[is_spot, 5] = 0.0
+    return step
+
+
+def _take(windows: Windows, chosen: NDArray) -> Windows:
+    if len(chosen) == len(windows.index):
+        return windows
+    return Windows(*(getattr(windows, name)[chosen] for name in Windows.__dataclass_fields__))
+
+
+def _take_fits(fits: EllipseFits, chosen: NDArray) -> EllipseFits:
+    if len(chosen) == len(fits.parameters):
+        return fits
+    return EllipseFits(*(getattr(fits, name)[chosen] for name in EllipseFits.__dataclass_fields__))
+
+
+def free_shading(fits: EllipseFits) -> tuple[Array, Array]:
+    """What the gain gradients would be if they were free, to first order.
+
+    Returns
+    -------
+    gradient : (n, 2) relative change of contrast per radius. variance : (n,) mean of the two.
+    """
+    contrast = np.maximum(np.abs(fits.parameters[:, 9]), 1e-3)
+    normal = fits.normal.copy()
+    precision = 1.0 / (np.maximum(fits.shading_sigma, _SHADING_SIGMA_MIN) * contrast) ** 2
+    right = np.zeros((len(normal), PARAMETERS))
+    for k in (10, 11):
+        # taking the prior away moves the minimum by its own pull
+        right[:, k] = precision * fits.parameters[:, k]
+        normal[:, k, k] -= precision
+    return _marginal_shading(fits, normal, right, contrast)
+
+
+def _marginal_shading(fits: EllipseFits, normal: Array, right: Array, contrast: Array) -> tuple[Array, Array]:
+    scale = 1.0 / np.sqrt(np.maximum(np.diagonal(normal, axis1=1, axis2=2), 1e-300))
+    scaled = normal * scale[:, :, None] * scale[:, None, :]
+    scaled[:, np.arange(PARAMETERS), np.arange(PARAMETERS)] += 1e-10
+    # gradient of the data's cost at the present parameters equals minus the prior's pull (stationary point)
+    inverse = np.linalg.inv(scaled) * scale[:, :, None] * scale[:, None, :]
+    step = np.einsum("nij,nj->ni", inverse, right)
+    gradient = (fits.parameters[:, 10:12] + step[:, 10:12]) / contrast[:, None]
+    variance = 0.5 * (inverse[:, 10, 10] + inverse[:, 11, 11]) / contrast**2
+    return gradient, np.maximum(variance, 1e-18)
+
+
+def outliers(fits: EllipseFits, windows: Windows) -> NDArray[np.bool_]:
+    """(n, p) pixels that neither noise nor a slightly wrong model explains: hot pixels, dust."""
+    contrast = np.abs(fits.parameters[:, 9, None])
+    normalised = np.abs(fits.residual) * np.sqrt(fits.weight)
+    # the model's own misfit is the typical residual
+    typical = np.sqrt(np.einsum("np,np->n", fits.weight, fits.residual**2) / np.maximum((fits.weight > 0).sum(axis=1), 1))
+    limit = _OUTLIER_SIGMA * np.maximum(1.0, np.minimum(typical, 3.0))[:, None]
+    flagged = windows.valid & (normalised > limit) & (np.abs(fits.residual) > 0.06 * contrast)
+    # more than a few percent of outliers is not dust but another shape
+    few = flagged.sum(axis=1) <= 0.04 * windows.valid.sum(axis=1)
+    return flagged & few[:, None]

@@ -1,0 +1,258 @@
+"""Reading of ring12 codes: 12 segments of 30 degrees between two and three radii around a dot.
+
+The dot's ellipse gives the affine map from the target's plane to the image up to a turn; the turn (phase) and the
+segments' brightness are fitted to samples on circles of the target's plane. Blur is part of the model. A reading
+counts only if every segment is clearly bright or clearly dark and the whole ring looks as the code predicts; a ring
+that is partly covered or cut yields no code.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr
+
+from robcal.errors import InvalidInput
+
+Array = NDArray[np.float64]
+
+SEGMENTS = 12
+_PER_SEGMENT = 8
+_ANGLES = SEGMENTS * _PER_SEGMENT
+_RING = np.array([2.2, 2.4, 2.6, 2.8])  # radii of samples in the ring, in dot radii
+_GAP = np.array([1.4, 1.5, 1.6])
+_SEGMENT_ANGLE = 2.0 * np.pi / SEGMENTS
+_PHI = (np.arange(_ANGLES) + 0.5) * 2.0 * np.pi / _ANGLES
+_INTERPOLATION_VARIANCE = 0.15  # px^2, blur of bilinear interpolation, mean over the positions within a pixel
+
+_EVIDENCE = 0.35  # of the dot's contrast, somewhere on the ring: below it there is no ring
+_MARGIN = 0.25  # a segment's brightness must keep this distance from the half
+_RMS_MAX = 0.14  # of the ring's brightness, readings minus prediction over the ring
+_PATCH_MAX = 0.42  # the same, mean over any patch of 1/4 segment by half the ring's width
+_GAP_MAX = 0.22
+
+
+def canonical_id(bits: int) -> int:
+    """The smallest of the 12 cyclic readings of 12 bits.
+
+    Raises
+    ------
+    InvalidInput : bits outside 0..4095.
+    """
+    if not 0 <= bits < 1 << SEGMENTS:
+        raise InvalidInput(f"a ring12 reading has 12 bits: {bits} is not in 0..4095")
+    mask = (1 << SEGMENTS) - 1
+    return min(((bits << k) | (bits >> (SEGMENTS - k))) & mask for k in range(SEGMENTS))
+
+
+def is_id(number: int) -> bool:
+    """True for the ids of ring12: 151 is one, 302 is not."""
+    return 0 <= number < 1 << SEGMENTS and canonical_id(number) == number
+
+
+@dataclass(frozen=True)
+class RingReadings:
+    """Readings of n rings.
+
+    Attributes
+    ----------
+    code : (n,) id or -1. evidence : (n,) bool, something bright stands where the ring would be.
+    phase : (n,) angle in the target's plane (of the dot's unit circle) where the first segment begins, rad.
+    bits : (n, 12) bool in the order of increasing angle from the phase. level : (n,) the ring's brightness by the
+    dot's contrast.
+    """
+
+    code: NDArray[np.int64]
+    evidence: NDArray[np.bool_]
+    phase: Array
+    bits: NDArray[np.bool_]
+    level: Array
+
+
+def _matrices(b: Array) -> Array:
+    """(n, 2, 2) B from (n, 3)."""
+    return np.stack([b[:, [0, 1]], b[:, [1, 2]]], axis=1)
+
+
+def _bilinear(image: NDArray, x: Array, y: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Values at sub-pixel places and whether they lie in the image."""
+    height, width = image.shape
+    inside = (x >= 0) & (y >= 0) & (x <= width - 1) & (y <= height - 1)
+    column = np.clip(np.floor(x).astype(int), 0, width - 2)
+    row = np.clip(np.floor(y).astype(int), 0, height - 2)
+    fx, fy = np.clip(x - column, 0, 1), np.clip(y - row, 0, 1)
+    upper = image[row, column] * (1 - fx) + image[row, column + 1] * fx
+    lower = image[row + 1, column] * (1 - fx) + image[row + 1, column + 1] * fx
+    return upper * (1 - fy) + lower * fy, inside
+
+
+def _profile_widths(b: Array, s: Array, phi: Array) -> tuple[Array, Array]:
+    """Blur along the radius and along the angle (times rho) in the dot's unit plane, (n, k), at angles phi (k,)."""
+    matrix = _matrices(b)
+    normal = np.stack([np.cos(phi), np.sin(phi)], axis=-1)
+    tangent = np.stack([-np.sin(phi), np.cos(phi)], axis=-1)
+    radial = np.linalg.norm(np.einsum("nij,kj->nki", matrix, normal), axis=-1)
+    angular = np.linalg.norm(np.einsum("nij,kj->nki", matrix, tangent), axis=-1)
+    return s[:, None] * radial, s[:, None] * angular
+
+
+def _window(delta: Array, sigma: Array) -> Array:
+    """A segment's brightness at the angle delta from its middle, blurred by sigma (rad)."""
+    half = 0.5 * _SEGMENT_ANGLE
+    return ndtr((delta + half) / sigma) - ndtr((delta - half) / sigma)
+
+
+def _wrap(angle: Array) -> Array:
+    return (angle + np.pi) % (2.0 * np.pi) - np.pi
+
+
+def read_rings(
+    image: NDArray, xy: Array, b: Array, blur: Array, background: Array, contrast: Array, noise_sigma: Array,
+    saturation: float, known_codes: frozenset[int] | None = None,
+) -> RingReadings:  # fmt: skip
+    """Reads the codes around n fitted dots.
+
+    Parameters
+    ----------
+    image : (h, w), bright dots. xy : (n, 2). b : (n, 3) ellipse matrix B11, B12, B22 (B maps pixels to the unit circle).
+    blur : (n,) s of the edge profile, px. background, contrast : (n,) grey values. noise_sigma : (n,) of one pixel.
+    saturation : grey value above which nothing is known. known_codes : only these are codes.
+    """
+    n = len(xy)
+    empty = RingReadings(
+        np.full(n, -1, np.int64), np.zeros(n, bool), np.zeros(n), np.zeros((n, SEGMENTS), bool), np.zeros(n)
+    )
+    if n == 0:
+        return empty
+    # a censored dot is brighter than what the ring can show
+    contrast = np.minimum(contrast, saturation - background)
+    to_image = np.linalg.inv(_matrices(b))
+    s = np.sqrt(blur**2 + _INTERPOLATION_VARIANCE)
+    rho = np.concatenate([_GAP, _RING])
+    circle = np.stack([np.cos(_PHI), np.sin(_PHI)], axis=-1)
+    places = np.einsum("nij,aj->nai", to_image, circle)[:, None] * rho[None, :, None, None] + xy[:, None, None]
+    grey, inside = _bilinear(image, places[..., 0], places[..., 1])
+    complete = inside.all(axis=(1, 2))
+    radial, angular = _profile_widths(b, s, _PHI)
+    # in units of the dot's contrast, without the dot's own glare
+    y = (grey - background[:, None, None]) / np.maximum(contrast, 1e-6)[:, None, None]
+    y -= ndtr(-(rho[None, :, None] - 1.0) / radial[:, None, :])
+    gap, ring = y[:, : len(_GAP)], y[:, len(_GAP) :]
+    in_ring = _RING[None, :, None]
+    factor = ndtr((in_ring - 2.0) / radial[:, None]) - ndtr((in_ring - 3.0) / radial[:, None])
+    profile = (factor * ring).sum(axis=1) / (factor**2).sum(axis=1)
+    sigma_angle = angular / 2.5
+    evidence = np.sort(profile, axis=1)[:, -3] > _EVIDENCE
+    readable = np.flatnonzero(evidence & complete & (contrast > 0))
+    if readable.size == 0:
+        return RingReadings(empty.code, evidence, empty.phase, empty.bits, empty.level)
+    fit = _fit(profile[readable], sigma_angle[readable])
+    noise = noise_sigma[readable] / np.maximum(contrast[readable], 1e-6)
+    sure = _is_certain(fit, ring[readable], gap[readable], factor[readable], sigma_angle[readable], noise)
+    bits, phase, level = empty.bits.copy(), empty.phase.copy(), empty.level.copy()
+    bits[readable], phase[readable], level[readable] = fit.bits, fit.phase, fit.level
+    code = empty.code.copy()
+    for row, good in zip(readable, sure, strict=True):
+        reading = int("".join("1" if bit else "0" for bit in bits[row]), 2)
+        number = canonical_id(reading)
+        allowed = number in known_codes if known_codes is not None else 0 < number < (1 << SEGMENTS) - 1
+        if good and allowed:
+            code[row] = number
+    return RingReadings(code, evidence, phase, bits, level)
+
+
+@dataclass(frozen=True)
+class _Fit:
+    phase: Array
+    amplitude: Array  # (n, 12)
+    sigma: Array  # (n, 12) for unit noise of the profile
+    bits: NDArray[np.bool_]
+    level: Array
+
+
+def _fit(profile: Array, sigma_angle: Array) -> _Fit:
+    """Phase and segment brightnesses from (n, 96) profiles."""
+    n = len(profile)
+    # coarse phase: the shift by whole samples whose 12 sector means leave least
+    step = 2.0 * np.pi / _ANGLES
+    best, phase = np.full(n, np.inf), np.zeros(n)
+    for shift in range(_PER_SEGMENT):
+        blocks = np.roll(profile, -shift, axis=1).reshape(n, SEGMENTS, _PER_SEGMENT)
+        spread = ((blocks - blocks.mean(axis=2, keepdims=True)) ** 2).sum(axis=(1, 2))
+        better = spread < best
+        best[better], phase[better] = spread[better], shift * step
+    amplitude = np.zeros((n, SEGMENTS))
+    inverse = np.zeros((n, SEGMENTS, SEGMENTS))
+    middle = (np.arange(SEGMENTS) + 0.5) * _SEGMENT_ANGLE
+    ridge = 1e-6 * np.eye(SEGMENTS)
+    for _ in range(4):
+        delta = _wrap(_PHI[None, :, None] - phase[:, None, None] - middle[None, None, :])
+        sigma = sigma_angle[:, :, None]
+        templates = _window(delta, sigma)
+        inverse = np.linalg.inv(np.matmul(templates.transpose(0, 2, 1), templates) + ridge)
+        amplitude = np.einsum("nkl,npl,np->nk", inverse, templates, profile)
+        residual = profile - np.einsum("npk,nk->np", templates, amplitude)
+        half = 0.5 * _SEGMENT_ANGLE
+        upper, lower = (delta + half) / sigma, (delta - half) / sigma
+        density = (np.exp(-0.5 * np.minimum(upper**2, 60.0)) - np.exp(-0.5 * np.minimum(lower**2, 60.0))) / sigma
+        slope = -np.einsum("npk,nk->np", density, amplitude) / np.sqrt(2.0 * np.pi)
+        turn = (slope * residual).sum(axis=1) / np.maximum((slope**2).sum(axis=1), 1e-9)
+        phase = phase + np.clip(turn, -0.1, 0.1)
+    bright = amplitude > 0.5 * np.sort(amplitude, axis=1)[:, -1:]
+    level = np.where(bright, amplitude, 0.0).sum(axis=1) / np.maximum(bright.sum(axis=1), 1)
+    bits = amplitude > 0.5 * level[:, None]
+    return _Fit(phase, amplitude, np.sqrt(np.diagonal(inverse, axis1=1, axis2=2)), bits, level)
+
+
+def _is_certain(fit: _Fit, ring: Array, gap: Array, factor: Array, sigma_angle: Array, noise: Array) -> NDArray:
+    """(n,) True where nothing speaks against the reading."""
+    level = fit.level
+    good = (level > 0.45) & (level < 1.6)
+    scale = 1.0 / np.maximum(level, 1e-6)
+    # samples of one pixel are not independent: the profile's noise is about that of one pixel
+    sigma = fit.sigma * noise[:, None] * scale[:, None]
+    distance = np.abs(fit.amplitude * scale[:, None] - 0.5)
+    good &= (distance > np.maximum(_MARGIN, 4.0 * sigma)).all(axis=1)
+    # too blurred to be told apart
+    good &= (factor.max(axis=1) > 0.35).all(axis=1) & (sigma_angle.max(axis=1) < 0.45 * _SEGMENT_ANGLE)
+    middle = (np.arange(SEGMENTS) + 0.5) * _SEGMENT_ANGLE
+    templates = _window(
+        _wrap(_PHI[None, :, None] - fit.phase[:, None, None] - middle[None, None, :]), sigma_angle[:, :, None]
+    )
+    predicted = np.einsum("npk,nk->np", templates, fit.bits.astype(float))
+    misfit = ring * scale[:, None, None] - factor * predicted[:, None, :]
+    # a slow change of brightness around the ring is shading, not a wrong code
+    relative = noise * scale
+    rms = np.sqrt((misfit**2).mean(axis=(1, 2)))
+    good &= rms < np.hypot(_RMS_MAX, relative)
+    patch = 0.5 * (misfit[:, 0::2] + misfit[:, 1::2])
+    patch = 0.5 * (patch + np.roll(patch, 1, axis=2))
+    good &= np.abs(patch).max(axis=(1, 2)) < np.hypot(_PATCH_MAX, 3.0 * relative)
+    smooth_gap = gap.mean(axis=1)
+    smooth_gap = (smooth_gap + np.roll(smooth_gap, 1, axis=1) + np.roll(smooth_gap, -1, axis=1)) / 3.0
+    # light that the ring's own blur brings into the gap
+    leak = (1.0 - factor[:, 0]) * predicted * level[:, None] * 0.5
+    good &= (np.abs(smooth_gap) < np.hypot(_GAP_MAX, 3.0 * noise)[:, None] + leak).all(axis=1)
+    return good
+
+
+def ring_glare(xy: Array, b: Array, s: Array, reading: RingReadings, row: Array, x: Array, y: Array) -> Array:
+    """Predicted brightness of the ring by the dot's contrast, (n, p), at pixels (n, p), for readings `row`."""
+    matrix = _matrices(b)
+    u = np.einsum("nij,npj->npi", matrix, np.stack([x - xy[:, 0, None], y - xy[:, 1, None]], axis=-1))
+    rho = np.maximum(np.hypot(u[..., 0], u[..., 1]), 1e-6)
+    normal = u / rho[..., None]
+    radial = s[:, None] * np.linalg.norm(np.einsum("nij,npj->npi", matrix, normal), axis=-1)
+    tangent = np.stack([-normal[..., 1], normal[..., 0]], axis=-1)
+    # at the ring's own radius: the glare inside comes from there
+    angular = s[:, None] * np.linalg.norm(np.einsum("nij,npj->npi", matrix, tangent), axis=-1) / 2.2
+    phi = np.arctan2(u[..., 1], u[..., 0])
+    total = np.zeros_like(rho)
+    for k in range(SEGMENTS):
+        lit = reading.bits[row, k]
+        middle = reading.phase[row] + (k + 0.5) * _SEGMENT_ANGLE
+        total += lit[:, None] * _window(_wrap(phi - middle[:, None]), angular)
+    across = ndtr((rho - 2.0) / radial) - ndtr((rho - 3.0) / radial)
+    return reading.level[row][:, None] * total * across

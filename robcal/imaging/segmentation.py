@@ -1,0 +1,251 @@
+"""Bright blobs of an image: local background, threshold per blob, shapes that could be a dot.
+
+The background is a morphological opening of the image at coarse scale. What rises above it by some sigma is cut into
+blobs by a tree of thresholds: each blob is taken at the level half way between the level at which it merges with
+others and its own peak, so that a dot in the gap of a code ring, on a bright plate or in the glare of a lamp gets a
+threshold of its own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from robcal.imaging.detections import Reason, RejectionLog
+from robcal.imaging.noise import NoiseModel
+from robcal.imaging.settings import DetectionSettings
+
+Array = NDArray[np.float64]
+
+_MAX_NODES = 6000  # thresholds tried in one image; a photograph of something else must not take minutes
+_MAX_DEPTH = 7
+_CROSS = np.ones((5, 5), np.uint8)
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Blobs that may be dots, n of them, from moments of their pixels: a start for the fit.
+
+    Attributes
+    ----------
+    xy : (n, 2). semi_axes : (n, 2) major first. angle : (n,) rad. base, peak : (n,) grey values. blur : (n,) px.
+    nodes_exhausted : the image had more structure than is looked at.
+    """
+
+    xy: Array
+    semi_axes: Array
+    angle: Array
+    base: Array
+    peak: Array
+    blur: Array
+    nodes_exhausted: bool = False
+
+    def __len__(self) -> int:
+        return len(self.xy)
+
+    def take(self, chosen: NDArray) -> Candidates:
+        """The chosen rows."""
+        return Candidates(
+            self.xy[chosen], self.semi_axes[chosen], self.angle[chosen], self.base[chosen], self.peak[chosen],
+            self.blur[chosen], self.nodes_exhausted,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Node:
+    """A connected part of the image above `base`: its box's corner, and the mask of its pixels in the box."""
+
+    x: int
+    y: int
+    mask: NDArray[np.uint8]
+    base: float
+    depth: int
+
+
+def coarse_background(image: NDArray, max_axis_px: float) -> NDArray:
+    """Background of bright things up to three times the largest dot (a code ring), same shape and type as the image."""
+    height, width = image.shape
+    factor = int(np.clip(round(max_axis_px / 8.0), 2, 16))
+    rows, columns = height // factor, width // factor
+    if rows < 3 or columns < 3:
+        return np.full_like(image, int(np.median(image)))
+    small = cv2.resize(image[: rows * factor, : columns * factor], (columns, rows), interpolation=cv2.INTER_AREA)
+    half = int(np.ceil(3.3 * max_axis_px / factor))
+    # beyond three times the coarse image the kernel changes nothing
+    half = min(half, max(rows, columns))
+    opened = cv2.morphologyEx(small, cv2.MORPH_OPEN, np.ones((2 * half + 1, 2 * half + 1), np.uint8))
+    opened = cv2.blur(opened, (5, 5))
+    return cv2.resize(opened, (width, height), interpolation=cv2.INTER_LINEAR)
+
+
+def find_candidates(
+    image: NDArray, noise: NoiseModel, settings: DetectionSettings, log: RejectionLog
+) -> Candidates:
+    """Blobs brighter than their surroundings that could be the image of a dot.
+
+    Parameters
+    ----------
+    image : (h, w) uint8 or uint16, bright dots (dark ones are turned over by the caller).
+    noise : its noise model. settings : limits. log : takes what is refused, with the reason.
+    """
+    background = coarse_background(image, settings.max_axis_px)
+    top = np.iinfo(image.dtype).max
+    lift = max(5.0 * float(np.sqrt(noise.at(float(np.median(background))))), 1.5 * noise.step)
+    threshold = cv2.add(background, float(min(int(np.ceil(lift)), top)))
+    above = cv2.compare(image, threshold, cv2.CMP_GT)
+    nodes = _first_nodes(above, threshold, settings, log)
+    found: list[tuple[float, ...]] = []
+    visited = 0
+    while nodes and visited < _MAX_NODES:
+        visited += 1
+        _split(nodes.pop(), image, noise, settings, nodes, found, log)
+    rows = np.array(found, dtype=float).reshape(-1, 8)
+    if len(rows) > settings.max_candidates:
+        order = np.argsort(-(rows[:, 6] - rows[:, 5]))
+        log.count(Reason.OVER_CAP, len(rows) - settings.max_candidates)
+        rows = rows[order[: settings.max_candidates]]
+    log.count(Reason.OVER_CAP, len(nodes))
+    return Candidates(rows[:, :2], rows[:, 2:4], rows[:, 4], rows[:, 5], rows[:, 6], rows[:, 7], bool(nodes))
+
+
+def _first_nodes(
+    above: NDArray[np.uint8], threshold: NDArray, settings: DetectionSettings, log: RejectionLog
+) -> list[_Node]:
+    """Connected parts above the background, by contours (fast where there are few), small ones last in the list."""
+    contours, hierarchy = cv2.findContours(above, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
+    nodes: list[_Node] = []
+    if hierarchy is None:
+        return nodes
+    small = 0
+    outer = np.flatnonzero(hierarchy[0][:, 3] < 0)
+    boxes: list[tuple[int, int, int, int, int, int, int]] = []
+    for index in outer:
+        contour = contours[index]
+        if len(contour) < 3:
+            small += 1
+            continue
+        x, y, width, height = cv2.boundingRect(contour)
+        if width * height < 4:
+            small += 1
+            continue
+        px, py = (int(value) for value in contour[0, 0])
+        boxes.append((width * height, x, y, width, height, px - x, py - y))
+    log.count(Reason.TOO_SMALL, small)
+    if len(boxes) > _MAX_NODES:
+        # what is nearest to a dot's size is looked at first; the rest is counted
+        log.count(Reason.OVER_CAP, len(boxes) - _MAX_NODES)
+        smallest = np.pi * settings.min_axis_px**2
+        boxes.sort(key=lambda box: (box[0] < smallest, box[0]))
+        boxes = boxes[:_MAX_NODES]
+    boxes.sort(reverse=True)
+    for _, x, y, width, height, px, py in boxes:
+        part = above[y : y + height, x : x + width]
+        number, labels = cv2.connectedComponents(part, connectivity=8)
+        if number > 2:  # others reach into the box
+            part = (labels == labels[py, px]).view(np.uint8)
+        base = float(threshold[y + height // 2, x + width // 2])
+        nodes.append(_Node(x, y, part, base, 0))
+    return nodes
+
+
+def _split(
+    node: _Node, image: NDArray, noise: NoiseModel, settings: DetectionSettings,
+    nodes: list[_Node], found: list[tuple[float, ...]], log: RejectionLog,
+) -> None:  # fmt: skip
+    """Cuts one node half way between its base and its peak; dots go to `found`, the rest is cut again or refused."""
+    height, width = node.mask.shape
+    crop = image[node.y : node.y + height, node.x : node.x + width]
+    inside = crop[node.mask > 0]
+    if inside.size < 2:
+        return
+    # a high but not the highest value: one hot pixel is no peak
+    rank = min(3, inside.size // 6)
+    peak = float(inside.max() if rank == 0 else np.partition(inside, inside.size - 1 - rank)[inside.size - 1 - rank])
+    sigma = float(np.sqrt(noise.at(node.base)))
+    if peak - node.base < 0.5 * settings.min_contrast_sigma * sigma:
+        if node.depth == 0:
+            log.add(node.x + width / 2, node.y + height / 2, max(width, height) / 2, Reason.CONTRAST)
+        return
+    level = 0.5 * (node.base + peak)
+    core = cv2.bitwise_and(cv2.compare(crop, level, cv2.CMP_GT), node.mask)
+    number, labels, stats, centroids = cv2.connectedComponentsWithStats(core, connectivity=4, ltype=cv2.CV_32S)
+    for part in range(1, number):
+        left, upper, w, h, area = (int(value) for value in stats[part])
+        if area < 2:
+            continue
+        box = (slice(upper, upper + h), slice(left, left + w))
+        mask = (labels[box] == part).view(np.uint8)
+        x, y = node.x + left, node.y + upper
+        reason = _judge(mask, crop[box], area, level, node.base, (x, y), image.shape, settings, found)
+        if reason is None:
+            continue
+        values = crop[box][mask > 0]
+        part_peak = float(values.max())
+        # an evenly bright part has no dots of its own inside
+        even = float(values.mean()) - level > 0.5 * (part_peak - level)
+        if node.depth < _MAX_DEPTH and area > 12 and (not even or reason is Reason.TOO_LARGE) and part_peak - level > (
+            settings.min_contrast_sigma * sigma
+        ):
+            nodes.append(_Node(x, y, mask, level, node.depth + 1))
+            if reason is not Reason.TOO_LARGE:
+                continue
+        log.add(x + w / 2, y + h / 2, max(w, h) / 2, reason)
+    # fainter parts of the node that hang together with a brighter one only by its glare
+    if node.depth < _MAX_DEPTH and inside.size > 1.5 * np.count_nonzero(core) + 8:
+        rest = np.where(cv2.dilate(core, _CROSS) > 0, 0, node.mask).astype(np.uint8)
+        if np.count_nonzero(rest) >= 6:
+            _add_rest(rest, node, crop, settings.min_contrast_sigma * sigma, nodes)
+
+
+def _add_rest(rest: NDArray[np.uint8], node: _Node, crop: NDArray, lift: float, nodes: list[_Node]) -> None:
+    """Adds the connected parts of the rest that have a peak of their own."""
+    number, labels, stats, _ = cv2.connectedComponentsWithStats(rest, connectivity=4, ltype=cv2.CV_32S)
+    for part in range(1, number):
+        left, upper, w, h, area = (int(value) for value in stats[part])
+        if area < 4:
+            continue
+        box = (slice(upper, upper + h), slice(left, left + w))
+        mask = (labels[box] == part).view(np.uint8)
+        if float(crop[box][mask > 0].max()) - node.base > lift:
+            nodes.append(_Node(node.x + left, node.y + upper, mask, node.base, node.depth + 1))
+
+
+def _judge(
+    mask: NDArray[np.uint8], crop: NDArray, area: int, level: float, base: float, corner: tuple[int, int],
+    shape: tuple[int, ...], settings: DetectionSettings, found: list[tuple[float, ...]],
+) -> Reason | None:  # fmt: skip
+    """None and an entry in `found` if the blob may be a dot, else why not."""
+    height, width = mask.shape
+    x, y = corner
+    if max(width, height) > 2.2 * settings.max_axis_px + 2.0:
+        return Reason.TOO_LARGE
+    moments = cv2.moments(mask, binaryImage=True)
+    cx, cy = moments["m10"] / area, moments["m01"] / area
+    # a pixel is an area: 1/12 belongs to the second moments
+    sxx, syy = moments["mu20"] / area + 1 / 12, moments["mu02"] / area + 1 / 12
+    sxy = moments["mu11"] / area
+    mean, radius = 0.5 * (sxx + syy), float(np.hypot(0.5 * (sxx - syy), sxy))
+    major, minor = 2.0 * np.sqrt(mean + radius), 2.0 * np.sqrt(max(mean - radius, 1e-6))
+    fill = area / (np.pi * major * minor)
+    if minor < 0.6 * settings.min_axis_px:
+        return Reason.TOO_SMALL if area < 9 else Reason.ELONGATED
+    if major > 1.15 * settings.max_axis_px + 1.0:
+        return Reason.TOO_LARGE
+    if minor < 0.8 * settings.min_axis_ratio * major:
+        return Reason.ELONGATED
+    # filled ellipses have 1; half rings, crosses, squares with holes have less. Few pixels scatter
+    if abs(fill - 1.0) > 0.08 + 0.9 / np.sqrt(area):
+        return Reason.SHAPE
+    if x <= 1 or y <= 1 or x + width >= shape[1] - 1 or y + height >= shape[0] - 1:
+        return Reason.BORDER
+    values = crop[mask > 0]
+    peak = float(values.max())
+    high = int(np.count_nonzero(values > 0.5 * (level + peak)))
+    # between the levels 1/2 and 3/4 lie 0.674 sigma of a blurred edge, along the perimeter
+    blur = (area - high) / (0.674 * 2.0 * np.pi * np.sqrt(0.5 * (major**2 + minor**2)))
+    angle = 0.5 * np.arctan2(2.0 * sxy, sxx - syy)
+    found.append((x + cx, y + cy, major, minor, float(angle), base, peak, float(np.clip(blur, 0.35, 0.5 * minor + 0.5))))
+    return None

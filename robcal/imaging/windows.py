@@ -1,0 +1,121 @@
+"""Pixels around candidates, gathered into padded arrays of equal width so that all fits of a group run as one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robcal.imaging.edge_model import edge_distance, matrix_from_axes
+from robcal.imaging.segmentation import Candidates
+
+Array = NDArray[np.float64]
+
+_PIXELS_PER_GROUP = 400_000  # bounds the memory of a group's Jacobian to some 40 MB
+_INSIDE_MAX = 450  # pixels kept of the even inside; the centre is in the edge
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Pixels of n candidates, p each, padded.
+
+    Attributes
+    ----------
+    index : (n,) rows of the candidates. x, y, value : (n, p). valid : (n, p) bool.
+    radius : (n,) geometric mean of the start's semi-axes, px.
+    inside : (n, p) bool, well inside the edge. saturated : (n, p) bool.
+    """
+
+    index: NDArray[np.int64]
+    x: Array
+    y: Array
+    value: Array
+    valid: NDArray[np.bool_]
+    radius: Array
+    inside: NDArray[np.bool_]
+    saturated: NDArray[np.bool_]
+
+
+def _dilate(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """3x3 dilation over the last two axes."""
+    grown = mask.copy()
+    grown[:, 1:] |= mask[:, :-1]
+    grown[:, :-1] |= mask[:, 1:]
+    wide = grown.copy()
+    wide[:, :, 1:] |= grown[:, :, :-1]
+    wide[:, :, :-1] |= grown[:, :, 1:]
+    return wide
+
+
+def gather_windows(
+    image: NDArray, candidates: Candidates, saturation: float, neighbours: bool = True
+) -> list[Windows]:
+    """Windows of all candidates in groups of similar size.
+
+    Parameters
+    ----------
+    image : (h, w). candidates : starts. saturation : grey value from which a pixel is saturated.
+    neighbours : leave out the pixels of other bright things (with a border of one pixel).
+    """
+    n = len(candidates)
+    if n == 0:
+        return []
+    shape = np.column_stack([
+        candidates.xy, matrix_from_axes(candidates.semi_axes, candidates.angle), np.log(np.maximum(candidates.blur, 0.3))
+    ])  # fmt: skip
+    margin = 3.0 * candidates.blur + 2.0
+    # half extents of the ellipse along x and y
+    c2, s2 = np.cos(candidates.angle) ** 2, np.sin(candidates.angle) ** 2
+    a2, b2 = candidates.semi_axes[:, 0] ** 2, candidates.semi_axes[:, 1] ** 2
+    extent = np.sqrt(np.maximum(a2 * c2 + b2 * s2, a2 * s2 + b2 * c2))
+    half = np.ceil(extent + margin).astype(int)
+    # groups of nearly equal size waste little padding
+    size_class = np.where(half <= 12, half, 12 + np.ceil(np.log(np.maximum(half, 12) / 12.0) / 0.2).astype(int))
+    groups: list[Windows] = []
+    for cls in np.unique(size_class):
+        members = np.flatnonzero(size_class == cls)
+        h = int(half[members].max())
+        per_group = max(1, _PIXELS_PER_GROUP // (2 * h + 1) ** 2)
+        for start in range(0, len(members), per_group):
+            chosen = members[start : start + per_group]
+            groups.append(_gather(image, candidates, shape, margin, chosen, h, saturation, neighbours))
+    return groups
+
+
+def _gather(
+    image: NDArray, candidates: Candidates, shape: Array, margin: Array, chosen: NDArray[np.int64], half: int,
+    saturation: float, neighbours: bool,
+) -> Windows:  # fmt: skip
+    height, width = image.shape
+    offset = np.arange(-half, half + 1)
+    centre = np.rint(candidates.xy[chosen]).astype(int)
+    rows, columns = centre[:, 1, None] + offset, centre[:, 0, None] + offset
+    within = ((rows >= 0) & (rows < height))[:, :, None] & ((columns >= 0) & (columns < width))[:, None, :]
+    values = image[np.clip(rows, 0, height - 1)[:, :, None], np.clip(columns, 0, width - 1)[:, None, :]].astype(float)
+    n, side = len(chosen), len(offset)
+    x = np.broadcast_to(columns[:, None, :], (n, side, side)).astype(float)
+    y = np.broadcast_to(rows[:, :, None], (n, side, side)).astype(float)
+    distance = edge_distance(shape[chosen], x.reshape(n, -1), y.reshape(n, -1))[0].reshape(n, side, side)
+    blur = candidates.blur[chosen][:, None, None]
+    valid = within & (distance < margin[chosen][:, None, None])
+    if neighbours:
+        base, peak = candidates.base[chosen][:, None, None], candidates.peak[chosen][:, None, None]
+        other = (values > base + 0.2 * (peak - base)) & (distance > 2.0 * blur + 0.7)
+        valid &= ~_dilate(other)
+    inside = distance < -(3.0 * blur + 0.5)
+    # every k-th pixel of a large inside, in a pattern without direction
+    count = inside.sum(axis=(1, 2))
+    keep_every = np.maximum(1, np.ceil(count / _INSIDE_MAX)).astype(int)[:, None, None]
+    pattern = (2 * rows[:, :, None] + 3 * columns[:, None, :]) % keep_every == 0
+    valid &= ~inside | pattern
+    order = np.argsort(~valid.reshape(n, -1), axis=1, kind="stable")[:, : max(1, int(valid.sum(axis=(1, 2)).max()))]
+
+    def flat(array: NDArray) -> NDArray:
+        return np.take_along_axis(array.reshape(n, -1), order, axis=1)
+
+    value = flat(values)
+    return Windows(
+        chosen, flat(x), flat(y), value, flat(valid), np.sqrt(np.prod(candidates.semi_axes[chosen], axis=1)),
+        flat(inside), value >= saturation,
+    )  # fmt: skip
