@@ -18,7 +18,7 @@ from robcal.errors import InvalidInput
 from robcal.robot import c_templates as c
 from robcal.robot.c_expressions import array, function_body, number
 from robcal.robot.chain import Chain, chain_of
-from robcal.robot.compensation import cell_frames
+from robcal.robot.compensation import LARGEST_STEP, cell_frames
 from robcal.robot.inverse import carried_arm
 from robcal.robot.inverse_analytic import perpendicular
 from robcal.robot.inverse_numeric import NumericSettings, start_configurations
@@ -154,7 +154,7 @@ def _tables(chain: Chain, world_T_base: Array) -> str:
 def _inverse_parts(chain: Chain) -> list[str]:
     settings = NumericSettings()
     length = settings.weight(chain)[3]
-    parts = [c.VECTORS, c.CHAIN, f"\n#define ROTATION_LENGTH {number(length)}"]
+    parts = [c.VECTORS, c.CHAIN, f"\n#define ROTATION_LENGTH {number(length)}", f"#define LARGEST_STEP {LARGEST_STEP}"]
     if chain.n_joints < 6:
         parts.append(f"#define TILT_TOLERANCE {number(settings.tilt_tolerance)}")
     parts.append(c.NUMERIC)
@@ -163,11 +163,13 @@ def _inverse_parts(chain: Chain) -> list[str]:
     if arm is None or structure is None:
         starts = start_configurations(chain, 24)
         table = ",\n    ".join(array(s) for s in starts)
-        parts += [f"#define STARTS {len(starts)}", f"static const double START[STARTS][N] = {{\n    {table}}};"]
+        start_table = f"static const double START[STARTS][N] = {{\n    {table}}};"
+        parts += ["#define HELD 0", f"#define STARTS {len(starts)}", start_table]
         return [*parts, c.NUMERIC_INVERSE]
     probe = perpendicular(arm.axes[5] if isinstance(structure, SphericalWrist) else arm.axes[1])
     parts += [
         f"#define FIRST {first}",
+        "#define HELD FIRST",
         f"static const double HOME_INVERSE[12] = {array(invert(chain.home)[:3].ravel())};",
         f"static const double CENTRE[3] = {array(structure.centre)};",
         f"static const double PROBE[3] = {array(probe)};",

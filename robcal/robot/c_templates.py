@@ -752,57 +752,88 @@ void @P@_world_from_base(const double base_T_x[12], double world_T_x[12])
     multiply(WORLD_T_BASE, base_T_x, world_T_x);
 }
 
-/* One correction: F* <- F* Fh^-1 F, then its joint values. */
-static int correct(const double *F, const double *real, double *target, double *q)
+static int inside(const double *q)
 {
-    double Fh[12], next[N];
+    int i;
+    for (i = 0; i < N; ++i) {
+        if (!(q[i] <= UPPER[i] + SLACK && q[i] >= LOWER[i] - SLACK)) {
+            return 0;
+        }
+    }
+    return 1;
+}
+
+/* Joint step of the nominal robot that takes the real tool to the target; 0 if a limit or a singularity forbids it. */
+static int step(const double *target, const double *real, double *q)
+{
+    double T[12], J[6 * N], r[6], A[N][N], b[N], next[N], largest = 0.0;
+    int i, j, k;
+    chain(q, T, J);
+    difference(real, target, r);
+    for (i = 0; i < N; ++i) {
+        for (j = 0; j <= i; ++j) {
+            double s = 0.0;
+            for (k = 0; k < 6; ++k) {
+                s += (k < 3 ? 1.0 : ROTATION_LENGTH * ROTATION_LENGTH) * J[6 * i + k] * J[6 * j + k];
+            }
+            /* a track under the arm stays where it is */
+            A[i][j] = A[j][i] = (j < HELD) ? (i == j) : s + (i == j ? 1e-14 : 0.0);
+        }
+        b[i] = 0.0;
+        for (k = 0; k < 6 && i >= HELD; ++k) {
+            b[i] += (k < 3 ? 1.0 : ROTATION_LENGTH * ROTATION_LENGTH) * J[6 * i + k] * r[k];
+        }
+    }
+    if (!solve(A, b)) {
+        return 0;
+    }
+    for (i = 0; i < N; ++i) {
+        largest = fmax(largest, fabs(b[i]));
+    }
+    for (i = 0; i < N; ++i) {
+        next[i] = q[i] + b[i] * (largest > LARGEST_STEP ? LARGEST_STEP / largest : 1.0);
+    }
+    if (!inside(next)) {
+        return 0;
+    }
+    memcpy(q, next, sizeof next);
+    return 1;
+}
+
+/* One correction: F* <- F* Fh^-1 F with F* = K(q), then its joint values. */
+static int correct(const double *F, const double *real, double *q)
+{
+#if N >= 6
+    double Fh[12], T[12], inverse[12], gap[12], target[12], next[N];
     int result;
     multiply(BASE_T_WORLD, real, Fh);
-#if N >= 6
-    {
-        double inverse[12], step[12], corrected[12];
-        invert(Fh, inverse);
-        multiply(inverse, F, step);
-        multiply(target, step, corrected);
-        memcpy(target, corrected, sizeof corrected);
-        result = @P@_nominal_inverse(target, q, next);
-    }
-#else
-    {
-        double here[N], there[N];
-        int i;
-        (void)target;
-        result = @P@_nominal_inverse(Fh, q, here);
-        if (result == @P@_OK) {
-            result = @P@_nominal_inverse(F, q, there);
-        }
-        if (result == @P@_OK) {
-            for (i = 0; i < N; ++i) {
-                next[i] = q[i] + there[i] - here[i];
-                if (next[i] > UPPER[i] + SLACK || next[i] < LOWER[i] - SLACK) {
-                    result = @P@_BEYOND_LIMITS;
-                }
-            }
-        }
-    }
-#endif
+    chain(q, T, 0);
+    invert(Fh, inverse);
+    multiply(inverse, F, gap);
+    multiply(T, gap, target);
+    result = @P@_nominal_inverse(target, q, next);
     if (result == @P@_OK) {
         memcpy(q, next, sizeof next);
     }
     return result;
+#else
+    /* fewer than six joints: position before orientation, in joint space */
+    double target[12];
+    multiply(WORLD_T_BASE, F, target);
+    return step(target, real, q) ? @P@_OK : @P@_BEYOND_LIMITS;
+#endif
 }
 
 int @P@_first_order(const double world_T_tool[12], const @P@_conditions *conditions, const double near[N],
                     double q[N], double *base_T_target)
 {
-    double F[12], target[12], real[12];
+    double F[12], real[12];
     int result;
     multiply(BASE_T_WORLD, world_T_tool, F);
-    memcpy(target, F, sizeof F);
     result = @P@_nominal_inverse(F, near, q);
     if (result == @P@_OK) {
         @P@_forward(q, conditions, real);
-        result = correct(F, real, target, q);
+        result = correct(F, real, q);
     }
     if (base_T_target) {
         chain(q, base_T_target, 0);
@@ -813,14 +844,14 @@ int @P@_first_order(const double world_T_tool[12], const @P@_conditions *conditi
 int @P@_exact(const double world_T_tool[12], const @P@_conditions *conditions, const double near[N],
               double q[N], double *base_T_target, double *remaining)
 {
-    double F[12], target[12], real[12], r[6], size = HUGE_VAL;
-    int result, round, k;
+    double F[12], real[12], r[6], size = HUGE_VAL, before;
+    int result, round, k, quick = 1;
     multiply(BASE_T_WORLD, world_T_tool, F);
-    memcpy(target, F, sizeof F);
     result = @P@_nominal_inverse(F, near, q);
     for (round = 0; result == @P@_OK; ++round) {
         @P@_forward(q, conditions, real);
         difference(world_T_tool, real, r);
+        before = size;
         size = 0.0;
         for (k = 0; k < (N >= 6 ? 6 : 3); ++k) {
             size = fmax(size, fabs(r[k]));
@@ -832,7 +863,12 @@ int @P@_exact(const double world_T_tool[12], const @P@_conditions *conditions, c
             result = @P@_NOT_CONVERGED;
             break;
         }
-        result = correct(F, real, target, q);
+        /* joint steps while they gain much; near singularities the closed form of the corrected target */
+        quick = quick && size < 0.25 * before;
+        if (!(quick && step(world_T_tool, real, q))) {
+            quick = 0;
+            result = correct(F, real, q);
+        }
     }
     if (base_T_target) {
         chain(q, base_T_target, 0);

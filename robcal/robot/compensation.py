@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from robcal.errors import InvalidInput
-from robcal.robot.chain import Chain, chain_of, forward
+from robcal.robot.chain import Chain, chain_of, forward, forward_and_jacobian
 from robcal.robot.inverse import Selection, check_frames, follow, inverse_kinematics, select
 from robcal.robot.inverse_numeric import BoolArray, NumericSettings, refine
 from robcal.robot.kernel import Kernel, PoseInputs
@@ -28,6 +28,12 @@ from robcal.robot.model import GEOMETRIC_KINDS, RobotModel
 from robcal.transforms import Array, difference, frame_from_xyzrpy, invert
 
 Rows = NDArray[np.int_]
+LEFT_OVER = 1e-6
+"""m and rad; an exact command that leaves more than this is not handed out as one."""
+
+LARGEST_STEP = 0.1
+"""rad or m; a single joint step is no longer than this (near a singularity it would be without bound)."""
+
 Method = Literal["exact", "first_order", "none"]
 
 
@@ -193,11 +199,15 @@ def _correct(
     q = state.q[rows]
     Fh = invert(world_T_base) @ kernel.frames(kernel.theta0, every.subset(rows).with_q(q))
     if chain.n_joints < 6:
-        # Fewer than six joints: the target's unreachable part must not pile up in F*, so the correction is made in
-        # joint space, q <- q + K^-1(F) - K^-1(Fh).
-        here = select(inverse_kinematics(chain, Fh, q, all_branches=False), explain=False)
-        there = select(inverse_kinematics(chain, F[rows], q, all_branches=False), explain=False)
-        new = q + there.q - here.q
+        # The target's unreachable part must not pile up in F*, so the correction is made in joint space: the nominal
+        # robot's step that takes the real tool to the target, position before orientation.
+        _, J = forward_and_jacobian(chain, q)
+        weight = NumericSettings().weight(chain)[:, None]
+        twist = difference(Fh, F[rows])[..., None]
+        normal = np.swapaxes(weight * J, 1, 2) @ (weight * J) + 1e-14 * np.eye(chain.n_joints)
+        step = np.linalg.solve(normal, np.swapaxes(weight * J, 1, 2) @ (weight * twist))[..., 0]
+        largest = np.max(np.abs(step), axis=1, keepdims=True)
+        new = q + step * np.minimum(1.0, LARGEST_STEP / np.maximum(largest, 1e-300))
         moved = np.all((new >= chain.lower - 1e-9) & (new <= chain.upper + 1e-9), axis=1)
         reasons: list[str | None] = ["the correction leads beyond a joint limit or out of the workspace"] * len(rows)
         new = np.where(moved[:, None], new, np.nan)
@@ -244,3 +254,10 @@ def _search_on(
     for k in np.flatnonzero(better):
         state.q[rows[k]], state.remaining[rows[k]] = q[k], twist[k]
         state.reason[rows[k]] = None
+    for i in rows[_size(chain, np.nan_to_num(state.remaining[rows])) > LEFT_OVER]:
+        distance, angle = (float(np.linalg.norm(part)) for part in (state.remaining[i, :3], state.remaining[i, 3:]))
+        state.reason[i] = (
+            "the nominal robot reaches the frame, the real one near it comes no nearer than "
+            f"{1e3 * distance:.3f} mm and {np.rad2deg(angle):.4f} deg within its limits"
+        )
+        state.q[i] = np.nan
