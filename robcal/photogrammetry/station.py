@@ -74,10 +74,10 @@ def orient_station(
     exterior, fixed, contradicting = connect_cameras(names, images, stated)
     bad = set(contradicting)
     rejected = [
-        RejectedMark(names[c], p, -1, "image contradicts the other cameras: another pose or a slipped image")
+        RejectedMark(names[c], p, -1, "image contradicts the other cameras: another pose or a slipped image", "contradiction")
         for c, p in sorted(bad)
     ]
-    rejected += [RejectedMark(names[c], p, -1, reason) for c, p, reason in failed]
+    rejected += [RejectedMark(names[c], p, -1, reason, "no_pose") for c, p, reason in failed]
     good = [s for s in images if (s.camera, s.pose) not in bad]
     if not good:
         raise DegenerateGeometry("the cameras contradict one another in every pose: images and poses do not belong together")

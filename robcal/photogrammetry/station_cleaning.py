@@ -63,9 +63,12 @@ def _drop_image(state: StationState, found: Evidence) -> list[RejectedMark]:
     state.drop(of_pose & np.isin(state.marks.camera, which))
     pose = int(state.poses[column])
     return [
-        RejectedMark(state.names[c], pose, -1, f"image contradicts the other cameras (chi-square {found.statistic:.0f})")
+        RejectedMark(
+            state.names[c], pose, -1, f"image contradicts the other cameras (chi-square {found.statistic:.0f})",
+            "contradiction",
+        )
         for c in which
-    ]
+    ]  # fmt: skip
 
 
 def _strongest(state: StationState, adjusted: Adjusted) -> Evidence | None:

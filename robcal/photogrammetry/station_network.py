@@ -114,12 +114,17 @@ class Evidence:
 
 @dataclass(frozen=True)
 class RejectedMark:
-    """A mark left out: camera, pose number, target id and why."""
+    """A mark left out: camera, pose number, target id (-1: the whole image) and why.
+
+    ``kind``: 'outlier' (one mark), 'contradiction' (the image does not fit the other cameras) or 'no_pose' (the image
+    alone carries no pose; its marks may still be intersected).
+    """
 
     camera: str
     pose: int
     target: int
     reason: str
+    kind: str = "outlier"
 
 
 @dataclass(frozen=True)
