@@ -18,7 +18,7 @@ from robcal.photogrammetry.bundle_normals import Factor, MarkOrder, State, build
 from robcal.photogrammetry.bundle_result import finish
 from robcal.photogrammetry.bundle_solver import Bars, Problem, minimise, robust_scale
 from robcal.photogrammetry.camera import INTRINSIC_NAMES, Camera
-from robcal.photogrammetry.datum import resolve_datum
+from robcal.photogrammetry.datum import DatumWish, InnerOver, resolve_datum
 from robcal.photogrammetry.determinacy import intrinsics_basis, singular_unknowns, undetermined
 from robcal.photogrammetry.lengths import bars_scale, rows_of
 from robcal.photogrammetry.network import CameraNetwork, ImageMarks, IntArray, Lengths, RejectedMark
@@ -67,13 +67,15 @@ class _Work:
     radii: Array
     normals: Array | None
     group_sigma: Array
+    names: tuple[str, ...]
+    ids: IntArray
     rejected: list[RejectedMark] = field(default_factory=list)
 
     def subset(self) -> tuple[IntArray, IntArray]:
         """Images and targets in use."""
         return np.unique(self.marks.image[self.kept]), np.unique(self.marks.target[self.kept])
 
-    def build(self, basis: Array, ids: IntArray, wish: str | tuple[int, ...], lengths: Lengths) -> tuple:
+    def build(self, basis: Array, ids: IntArray, wish: DatumWish, lengths: Lengths) -> tuple:
         """(problem, state, images, targets, note) of what is in use."""
         images, targets = self.subset()
         marks = self.marks.select(self.kept)
@@ -121,8 +123,8 @@ class _Work:
         xy, r = self.marks.xy[row], np.asarray(residual)
         self.rejected.append(
             RejectedMark(
-                int(self.marks.image[row]),
-                int(self.marks.target[row]),
+                self.names[int(self.marks.image[row])],
+                int(self.ids[self.marks.target[row]]),
                 (float(xy[0]), float(xy[1])),
                 (float(r[0]), float(r[1])),
                 float(statistic),
@@ -141,7 +143,7 @@ def adjust(
     image_names: Sequence[str] | None = None,
     lengths: Lengths | None = None,
     check_lengths: Lengths | None = None,
-    datum: str | tuple[int, ...] = "free",
+    datum: DatumWish = "free",
     diameters: ArrayLike | None = None,
     normals: Array | None = None,
     free_intrinsics: Sequence[str] = INTRINSIC_NAMES,
@@ -155,7 +157,7 @@ def adjust(
     camera_T_body0 : (n, 4, 4) approximate stations; points0 : (t, 3) m approximate coordinates.
     ids : (t,) target ids, default 0 .. t-1. image_names : (n,), default the indices.
     lengths : scale bars, weighted observations. check_lengths : compared only.
-    datum : 'free', 'bars' or the ids of targets held at ``points0``.
+    datum : 'free', 'bars', InnerOver(ids), or the ids of targets held at ``points0``.
     diameters : (t,) m of the dots, NaN or 0 where unknown: then no eccentricity is modelled for them.
     normals : (t, 3) of the dots; None: from the shape of the body.
     free_intrinsics : names of the numbers to estimate; ``f`` stands for fx and fy changed alike.
@@ -180,11 +182,11 @@ def adjust(
     radii = np.zeros(t) if diameters is None else np.nan_to_num(0.5 * np.asarray(diameters, dtype=float))
     groups = 1 if marks.group is None else int(np.max(marks.group, initial=0)) + 1
     state = State(camera, np.array(camera_T_body0, dtype=float), np.array(points0, dtype=float))
-    work = _Work(marks, state, np.arange(len(marks)), radii, normals, np.ones(groups))
+    work = _Work(marks, state, np.arange(len(marks)), radii, normals, np.ones(groups), names, target_ids)
     _drop_duplicates(work)
     left_out: list[tuple[str, str]] = []
     free = list(free_intrinsics)
-    shape_datum = datum if not isinstance(datum, str) else "free"
+    shape_datum: DatumWish = datum if isinstance(datum, (tuple, InnerOver)) else "free"
     while True:
         basis = intrinsics_basis(free)
         _clean(work, basis, free, target_ids, shape_datum, settings)
@@ -258,7 +260,7 @@ def _clean(
     basis: Array,
     free: Sequence[str],
     ids: IntArray,
-    datum: str | tuple[int, ...],
+    datum: DatumWish,
     settings: AdjustSettings,
 ) -> None:
     """Adjust without scale bars, first robustly, and take out gross errors until none is left."""
@@ -366,7 +368,7 @@ def _raise_singular(problem: Problem, state: State, free: Sequence[str], ids: In
 
 
 def _undetermined(
-    work: _Work, basis: Array, free: Sequence[str], ids: IntArray, datum: str | tuple[int, ...]
+    work: _Work, basis: Array, free: Sequence[str], ids: IntArray, datum: DatumWish
 ) -> tuple[str, ...]:
     """Free intrinsics that the marks do not determine, worst first."""
     if not free:
@@ -419,7 +421,7 @@ def _bring_to_scale(
     work: _Work,
     basis: Array,
     ids: IntArray,
-    datum: str | tuple[int, ...],
+    datum: DatumWish,
     lengths: Lengths,
     settings: AdjustSettings,
     notes: list[str],

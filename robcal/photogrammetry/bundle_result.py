@@ -33,6 +33,7 @@ def finish(
     check_lengths: Lengths,
     notes: tuple[str, ...],
     variance_components: bool,
+    iterate: bool = True,
 ) -> CameraNetwork:
     """Variance components until they stand still, then everything that a result has to say."""
     k = problem.basis.shape[1]
@@ -67,7 +68,8 @@ def finish(
             group_sigma=problem.group_sigma * grown,
             bars=replace(problem.bars, sigma=stated_sigma * bars_sigma0),
         )
-        state, summary = minimise(problem, state)
+        if iterate:
+            state, summary = minimise(problem, state)
         grown = np.ones(groups)
     factor_all = float(grown[0] ** 2) if groups == 1 else 1.0
     # one component and no bars: the estimate only scales all cofactors

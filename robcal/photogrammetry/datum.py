@@ -62,7 +62,17 @@ class Datum:
         return q
 
 
-def resolve_datum(wish: str | tuple[int, ...], ids: IntArray, points: Array, lengths: Lengths) -> tuple[Datum, str]:
+@dataclass(frozen=True)
+class InnerOver:
+    """Wish for inner constraints over some targets only (those whose given coordinates define the frame)."""
+
+    ids: tuple[int, ...]
+
+
+DatumWish = str | tuple[int, ...] | InnerOver
+
+
+def resolve_datum(wish: DatumWish, ids: IntArray, points: Array, lengths: Lengths) -> tuple[Datum, str]:
     """The datum for a wish ('free', 'bars' or ids of fixed targets) and a note ('' if there is nothing to say).
 
     'bars': inner constraints over the end points of the scale bars; where these do not span a triangle (one bar), the
@@ -86,6 +96,11 @@ def resolve_datum(wish: str | tuple[int, ...], ids: IntArray, points: Array, len
             note = "datum bars: the targets of the scale bars lie in one line, the free datum was taken instead"
             return Datum("inner", everything, scale, "free network (inner constraints over all targets)"), note
         raise InvalidInput(f"datum {wish!r} is unknown: give free, bars or the ids of fixed targets")
+    if isinstance(wish, InnerOver):
+        rows = np.array([known[int(v)] for v in wish.ids if int(v) in known], dtype=np.int64)
+        if spans_triangle(points[rows]):
+            return Datum("inner", rows, scale, f"inner constraints over {len(rows)} targets with given coordinates"), ""
+        raise DegenerateGeometry("the targets that should define the frame do not span a triangle: name more of them")
     missing = sorted(int(v) for v in wish if int(v) not in known)
     if missing:
         raise InvalidInput(f"targets {missing} of the fixed datum are not measured in two images: choose other targets")

@@ -133,9 +133,9 @@ class Lengths:
 
 @dataclass(frozen=True)
 class RejectedMark:
-    """A mark that the data snooping took out."""
+    """A mark that was taken out: name of the image, id of the target, px, and the test's chi-square (2 dof)."""
 
-    image: int
+    image: str
     target: int
     xy: tuple[float, float]
     residual: tuple[float, float]
