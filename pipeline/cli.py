@@ -42,6 +42,8 @@ def _answers(command: str, as_json: bool) -> Iterator[dict[str, Any]]:
     answer: dict[str, Any] = {}
     try:
         yield answer
+    except typer.Exit:
+        raise
     except RobcalError as error:
         _fail(command, as_json, " ".join(str(error).split()))
     except OSError as error:
@@ -99,8 +101,8 @@ def run(
 
     Stages: detect, survey, orient, measure, frames, identify, diagnose, verify, report.
     """
-    _check_stage(until, start)
     with _answers("run", as_json) as answer:
+        _check_stage(until, start)
         from pipeline.runner import run_campaign
 
         messages = Messages(quiet)

@@ -9,8 +9,8 @@ from typing import Any
 from pipeline.campaign import read_campaign
 from pipeline.files import storage_error
 from pipeline.messages import Messages
-from pipeline.runner import Done, campaign_of, is_run, open_run, run_campaign
-from pipeline.runs import read_json
+from pipeline.runner import Done, run_campaign
+from pipeline.runs import campaign_of, is_run, open_run, read_json
 from pipeline.schemas import proposal
 from robcal.errors import InvalidInput
 

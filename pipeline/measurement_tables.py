@@ -13,6 +13,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.frame_tables import SIX, frame_covariance_columns, twist_from_six
 from pipeline.tables import Table, read_table
 from robcal.errors import InvalidInput
 from robcal.transforms import Array, frame_from_xyzrpy
@@ -20,7 +21,6 @@ from robcal.transforms import Array, frame_from_xyzrpy
 IntArray = NDArray[np.int64]
 Kind = Literal["points", "frames", "distances", "sensor_points"]
 
-SIX = ("x", "y", "z", "roll", "pitch", "yaw")
 MAX_METRES = 10_000.0
 
 
@@ -174,36 +174,6 @@ def _positive_definite(table: Table, covariance: Array) -> Array:
         remedy = "its variances must outweigh its covariances, check the columns"
         raise table.error(int(np.argmax(bad)), f"the covariance is not positive definite: {remedy}")
     return covariance
-
-
-def frame_covariance_columns() -> list[tuple[str, int, int]]:
-    """Column names of a full 6x6 covariance of x, y, z, roll, pitch, yaw and the places of its elements."""
-    columns = []
-    for i, first in enumerate(SIX):
-        for j in range(i, 6):
-            unit = "mm2" if j < 3 else "deg2" if i >= 3 else "mm_deg"
-            columns.append((f"s{first}{SIX[j]}_{unit}", i, j))
-    return columns
-
-
-def twist_from_six(six: Array) -> Array:
-    """(n, 6, 6) Jacobian of the right perturbation (rho, omega) of a frame by its numbers x, y, z, roll, pitch, yaw.
-
-    With R = Rz(yaw) Ry(pitch) Rx(roll): rho = R' dt, and the body's turn is the sum of the rates about the line that
-    each angle turns about: omega = droll ex + Rx' dpitch ey + Rx' Ry' dyaw ez.
-    """
-    zero = np.zeros_like(six)
-    roll, pitch = zero.copy(), zero.copy()
-    roll[:, 3], pitch[:, 4] = six[:, 3], six[:, 4]
-    Rx = frame_from_xyzrpy(roll)[:, :3, :3]
-    Ry = frame_from_xyzrpy(pitch)[:, :3, :3]
-    R = frame_from_xyzrpy(six)[:, :3, :3]
-    jacobian = np.zeros((len(six), 6, 6))
-    jacobian[:, :3, :3] = np.swapaxes(R, 1, 2)
-    jacobian[:, 3, 3] = 1.0
-    jacobian[:, 3:, 4] = np.swapaxes(Rx, 1, 2)[:, :, 1]
-    jacobian[:, 3:, 5] = (np.swapaxes(Rx, 1, 2) @ np.swapaxes(Ry, 1, 2))[:, :, 2]
-    return jacobian
 
 
 def _frame_covariance(table: Table, six: Array) -> Array | None:

@@ -56,7 +56,8 @@ def in_processes(work: Callable[[A], B], items: Sequence[A], workers: int) -> It
             try:
                 yield from pool.map(work, items)
             except BrokenProcessPool:
-                raise InvalidInput("a worker process died, probably for lack of memory: run again with --workers 1") from None
+                remedy = "probably for lack of memory: run again with --workers 1"
+                raise InvalidInput(f"a worker process died, {remedy}") from None
             finally:
                 pool.shutdown(cancel_futures=True)
     finally:

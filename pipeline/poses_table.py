@@ -109,7 +109,7 @@ def read_poses(
         names=names,
         rows=table.rows,
         q=q,
-        payload=_payload(table, payloads),
+        payload=parse_payload(table, payloads),
         verify=_verify(table),
         approach=approach,
         approach_inferred=inferred,
@@ -155,7 +155,13 @@ def _check_limits(table: Table, robot: RobotModel, q: Array) -> None:
             )
 
 
-def _payload(table: Table, payloads: Collection[str]) -> tuple[str | None, ...]:
+def parse_payload(table: Table, payloads: Collection[str]) -> tuple[str | None, ...]:
+    """The column ``payload``: name per row, None where it is empty or not there.
+
+    Raises
+    ------
+    InvalidInput : a load that the campaign does not list.
+    """
     if "payload" not in table.columns:
         return (None,) * len(table)
     cells = table.columns["payload"]

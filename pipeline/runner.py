@@ -13,14 +13,23 @@ from typing import Any
 from pipeline.campaign import Campaign, read_campaign
 from pipeline.codec import StaleCache
 from pipeline.messages import Messages
-from pipeline.runs import Run, StageRecord, code_version, fingerprint, read_json, write_json
+from pipeline.runs import (
+    RUN_FORMAT,
+    Run,
+    StageRecord,
+    campaign_of,
+    code_version,
+    fingerprint,
+    read_json,
+    run_file,
+    write_json,
+)
 from pipeline.schemas import proposal
 from pipeline.stages.base import Context, Outcome, Stage
 from pipeline.stages.registry import STAGES
 from robcal.errors import InvalidInput, RobcalError
 
 STAGE_NAMES = tuple(stage.name for stage in STAGES)
-RUN_FORMAT = "robcal/run-1"
 
 
 class InternalError(RobcalError):
@@ -48,33 +57,6 @@ def processes() -> int:
     return len(affinity(0)) if affinity else os.cpu_count() or 1
 
 
-def open_run(path: Path) -> Run:
-    """The run in a folder.
-
-    Raises
-    ------
-    InvalidInput : the folder holds no run.
-    """
-    run = Run(path)
-    if not _run_file(run).is_file():
-        raise InvalidInput(f"{path}: is not a run folder: name the folder that 'pipeline run' wrote (its --out)")
-    return run
-
-
-def is_run(path: Path) -> bool:
-    """Whether a folder holds a run."""
-    return _run_file(Run(path)).is_file()
-
-
-def campaign_of(run: Run) -> Path:
-    """Path of the campaign that a run belongs to."""
-    return Path(str(read_json(_run_file(run)).get("campaign", "")))
-
-
-def _run_file(run: Run) -> Path:
-    return run.folder / "state" / "run.json"
-
-
 def run_campaign(
     path: Path,
     out: Path | None = None,
@@ -84,13 +66,14 @@ def run_campaign(
     only: Sequence[str] | None = None,
     messages: Messages | None = None,
     workers: int | None = None,
+    body: str | None = None,
 ) -> Done:
     """Run a campaign.
 
     Parameters
     ----------
     until : last stage to run; start : first stage that runs even if it is up to date.
-    only : restrict the run to these stages.
+    only : restrict the run to these stages; body : survey this body alone.
 
     Raises
     ------
@@ -111,7 +94,7 @@ def run_campaign(
         messages.record(f"run of {campaign.path} in {run.folder}")
         _adopt(run, campaign)
         run.load_hashes()
-        context = Context(campaign, run, messages, workers or processes())
+        context = Context(campaign, run, messages, workers or processes(), body)
         for note in campaign.notes:
             messages.info(note)
         for warning in campaign.warnings:
@@ -129,7 +112,7 @@ def _keep_inputs_apart(campaign: Campaign, run: Run) -> None:
 
 
 def _adopt(run: Run, campaign: Campaign) -> None:
-    path = _run_file(run)
+    path = run_file(run)
     here = str(campaign.path.resolve())
     if path.is_file() and campaign_of(run) != Path(here):
         before = read_json(path).get("name")
@@ -163,6 +146,7 @@ def _run_stages(context: Context, until: str | None, start: str | None, only: Se
         run.forget(stage.name)
         _run_stage(stage, key, context)
         ran.append(stage.name)
+        run.write_result(collect_result(run, campaign, names))
     result = collect_result(run, campaign, names)
     run.write_result(result)
     return Done(run, tuple(ran), tuple(skipped), result)
@@ -207,7 +191,8 @@ def stage_key(stage: Stage, context: Context, applying: Sequence[str]) -> str:
     for name in stage.after:
         record = run.record(name) if name in applying else None
         upstream[name] = dict(record.outputs) if record else None
-    return fingerprint(stage.name, files, stage.settings(campaign), upstream, code_version(*stage.code))
+    alone = context.body if stage.name == "survey" else None
+    return fingerprint(stage.name, files, stage.settings(campaign), upstream, code_version(*stage.code), alone)
 
 
 def collect_result(run: Run, campaign: Campaign, names: Sequence[str]) -> dict[str, Any]:

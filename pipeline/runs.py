@@ -18,7 +18,7 @@ from typing import Any
 import pipeline
 import robcal
 from pipeline import codec
-from pipeline.files import StorageError, sha256_of, storage_error, write_text
+from pipeline.files import sha256_of, storage_error, write_text
 from robcal.errors import InvalidInput, RobcalError
 
 try:
@@ -27,6 +27,7 @@ except ImportError:  # Windows has no flock; runs there are not guarded against 
     fcntl = None  # type: ignore[assignment]
 
 RECORD_FORMAT = "robcal/stage-record-1"
+RUN_FORMAT = "robcal/run-1"
 
 
 class RunLocked(RobcalError):
@@ -249,6 +250,34 @@ class Run:
             yield
 
 
+def open_run(path: Path) -> Run:
+    """The run in a folder.
+
+    Raises
+    ------
+    InvalidInput : the folder holds no run.
+    """
+    run = Run(path)
+    if not run_file(run).is_file():
+        raise InvalidInput(f"{path}: is not a run folder: name the folder that 'pipeline run' wrote (its --out)")
+    return run
+
+
+def is_run(path: Path) -> bool:
+    """Whether a folder holds a run."""
+    return run_file(Run(path)).is_file()
+
+
+def campaign_of(run: Run) -> Path:
+    """Path of the campaign that a run belongs to."""
+    return Path(str(read_json(run_file(run)).get("campaign", "")))
+
+
+def run_file(run: Run) -> Path:
+    """state/run.json: which campaign the run belongs to."""
+    return run.folder / "state" / "run.json"
+
+
 def _plain(name: str) -> str:
     if not name or name in {".", ".."} or any(c in name for c in "/\\\0"):
         raise InvalidInput(f"'{name}' cannot be the name of a body or camera: it names a file, use letters and digits")
@@ -312,15 +341,3 @@ def fingerprint(*pieces: Any) -> str:
     text = json.dumps(plain(list(pieces)), sort_keys=True, default=str)
     return hashlib.sha256(text.encode()).hexdigest()
 
-
-__all__ = [
-    "Run",
-    "RunLocked",
-    "StageRecord",
-    "StorageError",
-    "code_version",
-    "fingerprint",
-    "plain",
-    "read_json",
-    "write_json",
-]

@@ -19,12 +19,14 @@ class Context:
     Attributes
     ----------
     workers : processes for work on images; 1 works in this process.
+    body : the only body to survey, None for all.
     """
 
     campaign: Campaign
     run: Run
     messages: Messages
     workers: int = 1
+    body: str | None = None
 
 
 @dataclass(frozen=True)

@@ -158,7 +158,7 @@ def work(context: Context) -> Outcome:
 
 def _refuse_duplicate(seen: dict[str, str], content: str, path: Path) -> None:
     if content in seen:
-        raise InvalidInput(f"{path}: the same image as {seen[content]}, byte for byte: one of them is a copy, remove it")
+        raise InvalidInput(f"{path}: byte for byte the same image as {seen[content]}: one of them is a copy, remove it")
     seen[content] = str(path)
 
 
@@ -179,8 +179,8 @@ def _check(source: str, images: ImageSource, entries: Sequence[ImageEntry]) -> l
         why = f"camera file {images.start_path} says" if images.start_path else f"the other {source} images have"
         count = f" ({len(odd)} such images)" if len(odd) > 1 else ""
         raise InvalidInput(
-            f"{path}: {size[0]} x {size[1]} px, but {why} {expected[0]} x {expected[1]}{count}: one camera takes images "
-            "of one size, remove the strangers or correct the camera file"
+            f"{path}: {size[0]} x {size[1]} px, but {why} {expected[0]} x {expected[1]}{count}: one camera takes "
+            "images of one size, remove the strangers or correct the camera file"
         )
     empty = [entry for entry in own if entry.targets == 0]
     if len(empty) == len(own):

@@ -1,0 +1,32 @@
+"""Command export: the calibrated robot as C99 source and as URDF."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pipeline.calibrated import load_calibrated
+from pipeline.files import write_text
+from pipeline.runs import open_run
+from robcal.robot.c_export import export_c
+
+
+def export_run(folder: Path, c: Path | None, urdf: Path | None) -> list[Path]:
+    """Write the wanted exports; returns the files.
+
+    Raises
+    ------
+    InvalidInput : no calibrated robot in the run, or a model that has no counterpart in the format.
+    """
+    calibrated = load_calibrated(open_run(folder))
+    written: list[Path] = []
+    if c is not None:
+        source = export_c(calibrated.model, statics=calibrated.statics)
+        for name, text in ((source.header_name, source.header), (source.source_name, source.source)):
+            write_text(c / name, text)
+            written.append(c / name)
+    if urdf is not None:
+        from robcal.robot.urdf import urdf_text
+
+        write_text(urdf, urdf_text(calibrated.model))
+        written.append(urdf)
+    return written

@@ -1,0 +1,131 @@
+"""Commands predict and compensate: tables in, tables out, on the robot of a finished run."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.calibrated import Calibrated, load_calibrated, predicted
+from pipeline.frame_tables import SIX, frame_columns, sigma_columns
+from pipeline.poses_table import joint_columns, parse_payload, read_poses
+from pipeline.runs import open_run
+from pipeline.tables import read_table, write_table
+from robcal.errors import InvalidInput
+from robcal.robot.compensation import cell_frames, compensate
+from robcal.robot.kernel import Kernel
+from robcal.transforms import Array, difference, frame_from_xyzrpy
+
+
+def predict_run(folder: Path, poses: Path, out: Path, *, nominal: bool = False) -> dict[str, Any]:
+    """Write where the tool is at the given poses, in the measuring system's coordinates.
+
+    Raises
+    ------
+    InvalidInput : no calibrated robot in the run, or a table that contradicts the contract.
+    """
+    calibrated = load_calibrated(open_run(folder))
+    wanted = read_poses(poses, calibrated.model, calibrated.model.payloads, to_predict=True)
+    T, covariance = predicted(calibrated, wanted, nominal=nominal)
+    columns: dict[str, Sequence[object]] = {"pose": wanted.names, **frame_columns(T)}
+    if covariance is not None:
+        columns.update(sigma_columns(T, covariance))
+    write_table(out, columns)
+    return {"poses": len(wanted), "out": str(out), "nominal": nominal}
+
+
+@dataclass(frozen=True)
+class WantedFrames:
+    """Frames that the tool is to reach."""
+
+    names: tuple[str, ...]
+    T: Array
+    payload: tuple[str | None, ...]
+    covariates: dict[str, Array]
+
+
+def read_wanted(path: Path, payloads: Collection[str]) -> WantedFrames:
+    """Read a table of wanted tool frames: pose, six numbers, optional payload and covariates.
+
+    Raises
+    ------
+    InvalidInput : missing columns, NaN, doubled poses, an unknown payload.
+    """
+    table = read_table(path)
+    table.require(["pose", "x_mm", "y_mm", "z_mm", "roll_deg", "pitch_deg", "yaw_deg"])
+    if not len(table):
+        raise InvalidInput(f"{path}: lists no frames")
+    names = table.texts("pose")
+    table.unique(["pose"])
+    offsets = [table.numbers(f"{n}_mm") / 1000 for n in SIX[:3]]
+    six = np.column_stack([*offsets, *(np.radians(table.numbers(f"{n}_deg")) for n in SIX[3:])])
+    other = {"pose", "payload", *(f"{n}_mm" for n in SIX[:3]), *(f"{n}_deg" for n in SIX[3:])}
+    covariates = {n: v for n in table.columns if n not in other and (v := table.number_column(n)) is not None}
+    return WantedFrames(names, frame_from_xyzrpy(six), parse_payload(table, payloads), covariates)
+
+
+def compensate_run(
+    folder: Path, frames: Path, out: Path, *, as_frames: bool = False, in_base: bool = False
+) -> dict[str, Any]:
+    """Write the commands that bring the real tool to the wanted frames.
+
+    Raises
+    ------
+    InvalidInput : no calibrated robot in the run, a bad table, or a frame that the robot cannot reach.
+    """
+    calibrated = load_calibrated(open_run(folder))
+    model = calibrated.model
+    wanted = read_wanted(frames, model.payloads)
+    kernel = Kernel(model, calibrated.statics)
+    covariates = {name: np.full(len(wanted.T), value) for name, value in calibrated.defaults.items()}
+    covariates.update(wanted.covariates)
+    result = compensate(
+        kernel,
+        wanted.T,
+        payload=wanted.payload,
+        covariates=covariates,
+        near=_nearest_recorded(calibrated, kernel, wanted.T, in_base),
+        frame="base" if in_base else "world",
+    )
+    unreachable = np.flatnonzero(~result.reachable)
+    if len(unreachable):
+        i = int(unreachable[0])
+        count = f" ({len(unreachable)} of {len(wanted.T)} frames)" if len(unreachable) > 1 else ""
+        raise InvalidInput(
+            f"{frames}: the robot cannot reach frame '{wanted.names[i]}'{count}: {result.reason[i]}: move the frame, "
+            "or check whether it is in the coordinates stated by --in"
+        )
+    missed = [wanted.names[i] for i in np.flatnonzero(~result.converged)]
+    warnings = [f"{frames}: frame '{name}' is met only approximately (near a singular pose?)" for name in missed]
+    columns: dict[str, Sequence[object]] = {"pose": wanted.names}
+    if as_frames:
+        columns.update(frame_columns(result.F_star))
+    else:
+        for k, (name, factor) in enumerate(joint_columns(model)):
+            columns[name] = [f"{v:.9f}" for v in result.q[:, k] / factor]
+    write_table(out, columns)
+    remaining = np.linalg.norm(result.remaining[:, :3], axis=1) * 1000
+    before = np.linalg.norm(result.before[:, :3], axis=1) * 1000
+    return {
+        "frames": len(wanted.T),
+        "out": str(out),
+        "remaining_max_mm": float(remaining.max()),
+        "uncompensated_mean_mm": float(before.mean()),
+        "warnings": warnings,
+    }
+
+
+def _nearest_recorded(calibrated: Calibrated, kernel: Kernel, wanted: Array, in_base: bool) -> Array:
+    """Joint angles of the recorded pose whose tool is nearest, for each wanted frame: its configuration is kept."""
+    tools = calibrated.tools
+    if in_base:
+        wanted = cell_frames(kernel)[0] @ wanted
+    near = np.empty((len(wanted), calibrated.q.shape[1]))
+    for i, T in enumerate(wanted):
+        twist = difference(tools, T)
+        # half a metre of lever makes a turn comparable to a way
+        near[i] = calibrated.q[np.argmin(np.sum(twist[:, :3] ** 2, axis=1) + 0.25 * np.sum(twist[:, 3:] ** 2, axis=1))]
+    return near

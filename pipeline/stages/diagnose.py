@@ -1,0 +1,142 @@
+"""Stage diagnose: which physics the model leaves out; the extended model serves everything after it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from pipeline.bodies import body_for_robot
+from pipeline.calibrated import Calibrated
+from pipeline.campaign import Campaign
+from pipeline.poses_table import Poses
+from pipeline.runs import write_json
+from pipeline.stages.base import Context, Outcome, Stage, no_files
+from pipeline.stages.identify import load_identification, require_robot
+from pipeline.stages.observations import RobotRecording
+from pipeline.tables import write_table
+from robcal.diagnosis.contract import as_contract
+from robcal.diagnosis.diagnose import diagnose
+from robcal.diagnosis.recording import Accepted, Recording, fit
+from robcal.diagnosis.result import Diagnosis
+from robcal.diagnosis.selection import SelectionSettings
+from robcal.photogrammetry.bodies import Body
+from robcal.transforms import Array
+
+NAME = "diagnose"
+
+
+def recording_for_diagnosis(
+    poses: Poses, recording: RobotRecording, rows: Array, body: Body | None
+) -> Recording | None:
+    """The measurements of some poses in the form the diagnosis takes: the kind with the most of them."""
+    chosen = recording.select(rows, detailed=True)
+    if not chosen:
+        return None
+    covariates = {name: np.asarray(values)[rows] for name, values in poses.covariates.items()}
+    covariates.update({f"approach{k + 1}": poses.approach[rows, k] for k in range(poses.q.shape[1])})
+    covariates["index"] = rows.astype(float)
+    return Recording(
+        q=poses.q[rows],
+        payload=tuple(poses.payload[i] for i in rows),
+        covariates=covariates,
+        names=tuple(poses.names[i] for i in rows),
+        observations=max(chosen, key=lambda o: len(o.pose) * o.dimension),
+        body=body.name if body is not None else "body",
+        ids=tuple(int(i) for i in body.ids) if body is not None else (),
+    )
+
+
+def work(context: Context) -> Outcome:
+    """Diagnose the identified robot; verification poses only measure the gain."""
+    campaign, run = context.campaign, context.run
+    _, poses = require_robot(campaign)
+    identification = load_identification(run)
+    found, measured = identification.robot(), identification.recording
+    body = body_for_robot(campaign, run)
+    used = np.array([row for row, use in zip(identification.rows, found.used, strict=True) if use], dtype=np.int64)
+    recording = recording_for_diagnosis(poses, measured, used, body)
+    kept_out = np.array([i for i in measured.poses if poses.verify[i]], dtype=np.int64)
+    verify = recording_for_diagnosis(poses, measured, kept_out, body) if len(kept_out) else None
+    if recording is None:
+        return Outcome(notes=["nothing to diagnose"])
+    diagnosis = diagnose(
+        found.model,
+        recording,
+        found.names,
+        tuple(found.eliminated),
+        verify,
+        settings_of(campaign),
+        context.messages.info,
+    )
+    outputs = [run.diagnosis]
+    content = as_contract(diagnosis)
+    write_json(run.diagnosis, content)
+    table = content.get("next_poses")
+    if table:
+        write_table(run.next_poses, _columns(table))
+        outputs.append(run.next_poses)
+    calibrated: Calibrated = run.load("calibrated_identify")
+    if diagnosis.findings:
+        calibrated = dataclasses.replace(
+            calibrated,
+            model=diagnosis.model,
+            names=diagnosis.free,
+            covariance=_covariance(diagnosis, recording),
+            statics="converged",  # as the diagnosis fits
+            diagnosed=True,
+        )
+    outputs.append(run.save(f"calibrated_{NAME}", calibrated))
+    notes = [finding.statement for finding in diagnosis.findings] or ["nothing missing: the model explains the data"]
+    return Outcome({"diagnosis": _result(diagnosis)}, outputs, notes)
+
+
+def settings_of(campaign: Campaign) -> SelectionSettings:
+    """Settings of the diagnosis from campaign.yaml."""
+    return dataclasses.replace(SelectionSettings(), level=campaign.entry.diagnosis.level)
+
+
+def _covariance(diagnosis: Diagnosis, recording: Recording) -> Array:
+    """Covariance of the extended model's parameters: its terms are in the model, observation causes beside it."""
+    direct = [
+        Accepted(f.family, f.constants, f.values, f.covariance)
+        for f in diagnosis.findings
+        if f.family.displace is not None
+    ]
+    refit = fit(diagnosis.model, recording, diagnosis.free, direct)
+    at = [refit.free.index(name) for name in diagnosis.free]
+    return refit.covariance[np.ix_(at, at)] * refit.variance_factor
+
+
+def _columns(rows: Any) -> dict[str, list[object]]:
+    names: dict[str, None] = {}
+    for row in rows:
+        names.update(dict.fromkeys(row))
+    return {name: [row.get(name, "") for row in rows] for name in names}
+
+
+def _result(diagnosis: Diagnosis) -> dict[str, Any]:
+    before, after, floor = (v * 1000 for v in diagnosis.heldout)
+    causes: Sequence[dict[str, Any]] = [
+        {"cause": f.family.cause, "where": f.family.where, "direction": f.family.direction} for f in diagnosis.findings
+    ]
+    return {
+        "mismatch": diagnosis.mismatch,
+        "p_value": diagnosis.p_value,
+        "causes": causes,
+        "heldout_mm": {"before": before, "after": after, "noise_floor": floor},
+    }
+
+
+STAGE = Stage(
+    name=NAME,
+    applies=lambda campaign: campaign.robot is not None and campaign.poses is not None
+    and campaign.entry.diagnosis.enabled,
+    work=work,
+    inputs=no_files,
+    settings=lambda campaign: campaign.entry.diagnosis.model_dump(),
+    after=("identify",),
+    code=("robcal/diagnosis", "robcal/physics", "pipeline/stages/diagnose.py"),
+)

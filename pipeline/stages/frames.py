@@ -1,0 +1,96 @@
+"""Stage frames: the distance criterion, then one frame with covariance from the targets of each pose."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from pipeline.bodies import surveyed_or_given
+from pipeline.campaign import Campaign
+from pipeline.frame_tables import frame_columns, frame_covariance_columns, twist_from_six
+from pipeline.poses_table import Poses
+from pipeline.runs import Run
+from pipeline.stages.base import Context, Outcome, Stage
+from pipeline.tables import write_table
+from robcal.errors import InvalidInput
+from robcal.photogrammetry.bodies import Body
+from robcal.photogrammetry.measure_frames import MeasuredFrames, measure_frames
+from robcal.photogrammetry.measured_points import MeasuredPoints
+from robcal.transforms import Array, xyzrpy_from_frame
+
+NAME = "frames"
+
+
+def applies(campaign: Campaign) -> bool:
+    """Whether points are measured, three or more in some pose."""
+    if campaign.entry.station is not None:
+        return True
+    return any(len(t) and np.bincount(t.pose).max() >= 3 for t in campaign.measured("points"))
+
+
+def work(context: Context) -> Outcome:
+    """Frames of the body that the robot carries."""
+    campaign, run = context.campaign, context.run
+    if campaign.poses is None:
+        raise InvalidInput(f"{campaign.path}: no poses: add 'poses: poses.csv'")
+    points: MeasuredPoints = run.load("points")
+    body = _body(campaign, run)
+    tolerance = campaign.entry.quality.distance_tolerance_mm
+    frames = measure_frames(points, body, tolerance=None if tolerance is None else tolerance / 1000)
+    write_frames(run, campaign.poses, frames)
+    outputs = [run.save(NAME, frames), run.save("body_used", frames.body), run.frames]
+    names = campaign.poses.names
+    notes = [*frames.notes, *(f"pose '{names[r.pose]}' rejected: {r.reason}" for r in frames.rejected_poses)]
+    if frames.recurring.statement:
+        notes.append(f"recurring length deviations, evidence for the diagnosis: {frames.recurring.statement}")
+    return Outcome({"points": _result(points, frames)}, outputs, notes)
+
+
+def _body(campaign: Campaign, run: Run) -> Body | None:
+    name = campaign.carried_body
+    if name is None:
+        return None
+    if run.record("orient") is not None and run.has("orient"):
+        oriented: Body = run.load("orient").body
+        return oriented
+    return surveyed_or_given(campaign, run, name)
+
+
+def write_frames(run: Run, poses: Poses, frames: MeasuredFrames) -> None:
+    """frames.csv of the run, with the full covariance of the six numbers."""
+    T = frames.world_T_body
+    six = xyzrpy_from_frame(T)
+    jacobian = np.linalg.inv(twist_from_six(six))
+    scale = np.array([1000.0] * 3 + [180 / np.pi] * 3)
+    numbers = jacobian @ frames.covariance @ np.swapaxes(jacobian, 1, 2) * np.outer(scale, scale)
+    columns: dict[str, Any] = {"pose": [poses.names[i] for i in frames.pose], **frame_columns(T)}
+    for name, i, j in frame_covariance_columns():
+        columns[name] = [f"{v:.9g}" for v in numbers[:, i, j]]
+    columns["targets"] = [len(t) for t in frames.targets]
+    columns["method"] = list(frames.method)
+    write_table(run.frames, columns)
+
+
+def _result(points: MeasuredPoints, frames: MeasuredFrames) -> dict[str, Any]:
+    deviation: Array = np.abs(frames.pairs.deviation) * 1000
+    return {
+        "measured": len(points.pose),
+        "rejected": len(frames.rejected_points),
+        "length_deviation_mean_mm": float(deviation.mean()) if len(deviation) else None,
+        "length_deviation_max_mm": float(deviation.max()) if len(deviation) else None,
+        "frames": len(frames.pose),
+        "rejected_poses": len(frames.rejected_poses),
+        "noise_factor": frames.noise_factor,
+    }
+
+
+STAGE = Stage(
+    name=NAME,
+    applies=applies,
+    work=work,
+    inputs=lambda campaign: [body.file.path for body in campaign.bodies.values()],
+    settings=lambda campaign: campaign.entry.model_dump(include={"quality", "body"}),
+    after=("survey", "orient", "measure"),
+    code=("robcal/photogrammetry", "robcal/transforms.py", "pipeline/stages/frames.py", "pipeline/bodies.py"),
+)

@@ -1,0 +1,88 @@
+"""Stage measure: targets in the world, by forward intersection or from the tables of another system."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pipeline.campaign import Campaign
+from pipeline.poses_table import Poses
+from pipeline.runs import Run
+from pipeline.stages.base import Context, Outcome, Stage
+from pipeline.tables import write_table
+from robcal.errors import InvalidInput
+from robcal.photogrammetry.measured_points import MeasuredPoints
+
+NAME = "measure"
+
+
+def applies(campaign: Campaign) -> bool:
+    """Whether there are points, or cameras to intersect them."""
+    return campaign.entry.station is not None or bool(campaign.measured("points"))
+
+
+def work(context: Context) -> Outcome:
+    """Measure all targets in all poses."""
+    campaign, run = context.campaign, context.run
+    if campaign.poses is None:
+        raise InvalidInput(f"{campaign.path}: no poses: add 'poses: poses.csv'")
+    if campaign.entry.station is not None:
+        from pipeline.stages.orient import station_points
+
+        points = station_points(run)
+    else:
+        points = points_from_tables(campaign)
+    write_points(run, campaign.poses, points)
+    names = campaign.poses.names
+    notes = [f"pose '{names[p]}': the rays of the cameras contradict one another" for p in points.inconsistent_poses]
+    if points.resected is not None and len(points.resected.pose):
+        notes.append(f"{len(points.resected.pose)} poses by resection from one camera")
+    result = {"measured": len(points.pose), "rejected": len(points.rejected)}
+    return Outcome({"points": result}, [run.save("points", points), run.points], notes)
+
+
+def points_from_tables(campaign: Campaign) -> MeasuredPoints:
+    """Points of all tables together.
+
+    Raises
+    ------
+    InvalidInput : some tables state their uncertainty and others do not, or a target is measured twice in a pose.
+    """
+    tables = campaign.measured("points")
+    stated = [table.covariance is not None for table in tables]
+    if any(stated) and not all(stated):
+        silent = tables[stated.index(False)].path
+        raise InvalidInput(f"{silent}: states no uncertainty while other tables do: add the column sigma_mm")
+    covariance = np.concatenate([t.covariance for t in tables if t.covariance is not None]) if all(stated) else None
+    return MeasuredPoints.from_table(
+        np.concatenate([t.pose for t in tables]),
+        np.concatenate([t.target for t in tables]),
+        np.concatenate([t.values for t in tables]),
+        covariance,
+    )
+
+
+def write_points(run: Run, poses: Poses, points: MeasuredPoints) -> None:
+    """points.csv of the run."""
+    columns: dict[str, list[object]] = {
+        "pose": [poses.names[i] for i in points.pose],
+        "target": [int(t) for t in points.target],
+    }
+    for k, name in enumerate("xyz"):
+        columns[f"{name}_mm"] = [f"{v:.6f}" for v in points.p_world[:, k] * 1000]
+    covariance = points.total_covariance
+    if covariance is not None:
+        for name, i, j in (("xx", 0, 0), ("xy", 0, 1), ("xz", 0, 2), ("yy", 1, 1), ("yz", 1, 2), ("zz", 2, 2)):
+            columns[f"s{name}_mm2"] = [f"{v:.9g}" for v in covariance[:, i, j] * 1e6]
+    columns["cameras"] = [int(c) for c in points.n_cameras]
+    write_table(run.points, columns)
+
+
+STAGE = Stage(
+    name=NAME,
+    applies=applies,
+    work=work,
+    inputs=lambda campaign: [table.path for table in campaign.measured("points")],
+    settings=lambda campaign: [list(campaign.poses.names) if campaign.poses else [], campaign.entry.measurements],
+    after=("detect", "survey", "orient"),
+    code=("robcal/photogrammetry", "pipeline/stages/measure.py"),
+)

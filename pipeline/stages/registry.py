@@ -1,0 +1,17 @@
+"""The stages in the order in which they run."""
+
+from __future__ import annotations
+
+from pipeline.stages import detect, diagnose, frames, identify, measure, report, survey, verify
+from pipeline.stages.base import Stage
+
+STAGES: tuple[Stage, ...] = (
+    detect.STAGE,
+    survey.STAGE,
+    measure.STAGE,
+    frames.STAGE,
+    identify.STAGE,
+    diagnose.STAGE,
+    verify.STAGE,
+    report.STAGE,
+)

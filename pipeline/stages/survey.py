@@ -1,0 +1,227 @@
+"""Stage survey: bundle adjustment of each body that was photographed, with self-calibration of the camera."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from pipeline.body_file import BodyFile, write_body
+from pipeline.camera_file import CameraFile, write_camera
+from pipeline.campaign import BodySource, Campaign, ImageSource
+from pipeline.campaign_schema import CheckLengthEntry, FixedDatum, ScaleBarEntry, SurveyEntry
+from pipeline.measurement_tables import MarksTable
+from pipeline.runs import Run
+from pipeline.stages.base import Context, Outcome, Stage
+from pipeline.stages.detect import DetectionIndex, load_detections, sizes
+from robcal.errors import DegenerateGeometry, InvalidInput, NotIdentifiable, RobcalError
+from robcal.photogrammetry.bodies import Body
+from robcal.photogrammetry.camera import INTRINSIC_NAMES
+from robcal.photogrammetry.network import CameraNetwork, Lengths
+from robcal.photogrammetry.survey import BodyTarget, SurveyImage, SurveyResult, survey_body
+
+NAME = "survey"
+
+
+def work(context: Context) -> Outcome:
+    """Survey the bodies, or the one that was asked for."""
+    campaign, run = context.campaign, context.run
+    outputs, notes, results = [], [], {}
+    for name, source in campaign.bodies.items():
+        if source.survey is None or source.survey_entry is None or (context.body and name != context.body):
+            continue
+        done = survey_one(campaign, run, name, source)
+        body = surveyed_body(name, source.file, done.network)
+        outputs += [run.save(f"survey_{name}", done), run.save(f"body_{name}", body)]
+        outputs += _write(run, name, source.survey, body, done)
+        notes += [f"survey of '{name}': {note}" for note in _notes(done)]
+        results[name] = _result(done)
+    return Outcome({"survey": results}, outputs, notes)
+
+
+def survey_one(campaign: Campaign, run: Run, name: str, source: BodySource) -> SurveyResult:
+    """Survey one body.
+
+    Raises
+    ------
+    RobcalError : with the name of the body and its files in the message.
+    """
+    entry, images_of = source.survey_entry, source.survey
+    if entry is None or images_of is None:
+        raise InvalidInput(f"{campaign.path}: body '{name}' has no survey")
+    _check_lengths(campaign, name, entry)
+    images, size = _images(run, name, images_of, source.file)
+    targets = [
+        BodyTarget(t.id, t.code, t.diameter, t.xyz, None if t.sigma is None else max(t.sigma))
+        for t in source.file.targets
+    ]
+    datum = tuple(entry.datum.fixed) if isinstance(entry.datum, FixedDatum) else entry.datum
+    try:
+        return survey_body(
+            images,
+            targets,
+            size=size,
+            camera=images_of.start.camera if images_of.start else None,
+            scale_bars=lengths(entry.scale_bars),
+            check_lengths=lengths(entry.check_lengths),
+            datum=datum,
+            engine=campaign.entry.bundle.engine,
+        )
+    except RobcalError as error:
+        raise located(error, f"{campaign.path}: survey of body '{name}'") from None
+
+
+def located(error: RobcalError, where: str) -> RobcalError:
+    """The same error with the place in front of its message."""
+    if isinstance(error, NotIdentifiable):
+        return NotIdentifiable(f"{where}: {error}", error.parameters)
+    return type(error)(f"{where}: {error}") if isinstance(error, InvalidInput | DegenerateGeometry) else error
+
+
+def lengths(entries: list[ScaleBarEntry] | list[CheckLengthEntry]) -> Lengths | None:
+    """Known lengths in metres; sigma NaN where none is stated."""
+    if not entries:
+        return None
+    return Lengths(
+        np.array([e.targets for e in entries], dtype=np.int64),
+        np.array([e.length_mm / 1000 for e in entries]),
+        np.array([np.nan if e.sigma_mm is None else e.sigma_mm / 1000 for e in entries]),
+    )
+
+
+def _check_lengths(campaign: Campaign, name: str, entry: SurveyEntry) -> None:
+    """The same distance stated twice with different lengths is a contradiction of the file itself."""
+    seen: dict[tuple[int, ...], tuple[float, int]] = {}
+    for i, bar in enumerate(entry.scale_bars):
+        pair = tuple(sorted(bar.targets))
+        line = campaign.document.line(("bodies", name, "survey", "scale_bars", i)) or 0
+        if pair in seen and abs(seen[pair][0] - bar.length_mm) > 1e-9:
+            raise InvalidInput(
+                f"{campaign.path}, line {line}: scale bar {list(bar.targets)} is {bar.length_mm:g} mm here and "
+                f"{seen[pair][0]:g} mm in line {seen[pair][1]}: keep the right one"
+            )
+        seen[pair] = (bar.length_mm, line)
+
+
+def _images(run: Run, name: str, source: ImageSource, file: BodyFile) -> tuple[list[SurveyImage], tuple[int, int]]:
+    if source.marks is not None:
+        return marks_by_image(source.marks), source.size or _size_of_marks(source.marks)
+    index: DetectionIndex = run.load("detect")
+    key = f"survey/{name}"
+    found = load_detections(run, index, key)
+    return [SurveyImage(image, detections=targets) for image, targets in found.items()], sizes(index, key)
+
+
+def marks_by_image(table: MarksTable) -> list[SurveyImage]:
+    """Marks measured by another program, image by image."""
+    rows: dict[str, list[int]] = {}
+    for i, image in enumerate(table.image):
+        rows.setdefault(image, []).append(i)
+    return [
+        SurveyImage(image, marks=(table.target[at], table.xy[at], table.sigma[at][:, None, None] ** 2 * np.eye(2)))
+        for image, at in rows.items()
+    ]
+
+
+def _size_of_marks(table: MarksTable) -> tuple[int, int]:
+    """Image size where no file tells it: marks are taken to fill the image evenly on all sides."""
+    low, high = table.xy.min(axis=0), table.xy.max(axis=0)
+    width, height = np.maximum(np.ceil(high + np.maximum(low, 0.0) + 1), 2).astype(int)
+    return int(width), int(height)
+
+
+def surveyed_body(name: str, file: BodyFile, network: CameraNetwork) -> Body:
+    """The surveyed targets as a body. Targets that the file does not list (those of scale bars) are not on it."""
+    listed = {t.id: t for t in file.targets if t.id is not None}
+    unlisted_dot = any(t.id is None for t in file.targets)
+    rows = [i for i, t in enumerate(network.ids) if int(t) in listed or (unlisted_dot and int(t) >= 4096)]
+    at = np.array([3 * i + k for i in rows for k in range(3)], dtype=np.intp)
+    own = [listed.get(int(network.ids[i])) for i in rows]
+    common = next((t.diameter for t in file.targets if t.id is None and t.diameter is not None), np.nan)
+    return Body(
+        name=name,
+        ids=np.array([network.ids[i] for i in rows], dtype=np.int64),
+        points=network.points[rows],
+        covariance=network.points_covariance[np.ix_(at, at)],
+        codes=tuple(t.code if t is not None else None for t in own),
+        diameters=np.array(
+            [common if t is None else np.nan if t.diameter is None else t.diameter for t in own], dtype=float
+        ),
+        polarity=file.polarity,
+    )
+
+
+def _write(run: Run, name: str, source: ImageSource, body: Body, done: SurveyResult) -> list[Any]:
+    write_body(
+        run.body(name),
+        [int(i) for i in body.ids],
+        body.points,
+        body.covariance,
+        codes=body.codes,
+        diameters=[None if not np.isfinite(d) else float(d) for d in body.diameters],
+        polarity=body.polarity,
+        comment=f"surveyed: {done.frame}; {done.scale}",
+    )
+    sigma = np.sqrt(np.clip(np.diag(done.network.intrinsics_covariance), 0, None))
+    pixel = source.start.pixel_um if source.start is not None else None
+    camera = CameraFile(
+        done.network.camera, None, pixel, dict(zip(INTRINSIC_NAMES, map(float, sigma), strict=True))
+    )
+    path = run.camera(f"{NAME}_{name}")
+    write_camera(path, camera, f"self-calibrated in the survey of {name}")
+    return [run.body(name), path]
+
+
+def _notes(done: SurveyResult) -> list[str]:
+    notes = [*done.notes, *done.network.notes]
+    notes += [f"image {image} not used: {reason}" for image, reason in done.unused_images]
+    if done.unseen_ids:
+        notes.append(f"targets not surveyed: {', '.join(map(str, done.unseen_ids))}")
+    return notes
+
+
+def _result(done: SurveyResult) -> dict[str, Any]:
+    network = done.network
+    checked = network.check_lengths or network.scale_bars
+    return {
+        "images": len(network.image_names),
+        "targets": len(network.ids),
+        "sigma0_px": network.sigma0_px,
+        "rms_px": network.rms_px,
+        "length_error_mm": max((abs(c.error) for c in checked), default=float("nan")) * 1000,
+        "sigma0": network.sigma0,
+        "redundancy": network.redundancy_total,
+        "marks": len(network.marks),
+        "rejected": len(network.rejected),
+        "sigma_mm": float(np.sqrt(np.mean(network.points_sigma**2)) * 1000),
+        "frame": done.frame,
+        "scale": done.scale,
+        "engine": done.engine,
+    }
+
+
+STAGE = Stage(
+    name=NAME,
+    applies=lambda campaign: any(body.survey is not None for body in campaign.bodies.values()),
+    work=work,
+    inputs=lambda campaign: [
+        path
+        for body in campaign.bodies.values()
+        if body.survey is not None
+        for path in (
+            body.file.path,
+            *([body.survey.marks.path] if body.survey.marks else []),
+            *([body.survey.start_path] if body.survey.start_path else []),
+        )
+    ],
+    settings=lambda campaign: campaign.entry.model_dump(include={"bodies", "bundle"}),
+    after=("detect",),
+    code=(
+        "robcal/photogrammetry",
+        "robcal/least_squares.py",
+        "robcal/transforms.py",
+        "pipeline/stages/survey.py",
+        "pipeline/body_file.py",
+        "pipeline/camera_file.py",
+    ),
+)
