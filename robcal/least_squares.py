@@ -1,7 +1,8 @@
 """Gauss-Newton with halving line search, dependent parameters, covariance and redundancy of a whitened problem.
 
-A problem is linearised at a state as whitened residuals ``r = measured - model`` (m,) and ``J = d model / d step`` (m, p),
-so a step solves ``min |r - J step|``. The state may be anything that a step can move (an array, a frame, a network).
+A problem is linearised at a state as whitened residuals ``r = measured - model`` (m,) and Jacobian
+``J = d model / d step`` (m, p), so a step solves ``min |r - J step|``. The state may be anything that a step can move
+(an array, a frame, a network).
 """
 
 from __future__ import annotations

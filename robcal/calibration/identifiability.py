@@ -16,15 +16,15 @@ from numpy.typing import NDArray
 from scipy import linalg, stats
 
 from robcal.errors import InvalidInput
-from robcal.robot.kernel import Kernel, PoseInputs
 from robcal.robot.model import ANGLE_OF_AXIS, ELASTIC_KINDS, GEOMETRIC_KINDS, RobotModel
+from robcal.robot.statics import moment_names
 from robcal.robot.terms import identifier
 
 Array = NDArray[np.float64]
 
-PLAUSIBLE_LENGTH = 5e-3
+PLAUSIBLE_LENGTH = 2e-3
 """A length deviation (m) that the data determine worse than this is left at nominal."""
-PLAUSIBLE_ANGLE = 5e-3
+PLAUSIBLE_ANGLE = 2e-3
 """The same for angles (rad), and for what an elasticity turns its angle at the largest moment met."""
 
 OWN_AXIS_LEVEL = 0.05
@@ -95,11 +95,14 @@ def choose_candidates(model: RobotModel, parameters: str | Sequence[str]) -> Can
     return Candidates(tuple(dict.fromkeys((*ends, *parameters, *terms))))
 
 
-def plausible_limits(kernel: Kernel, theta: Array, poses: PoseInputs, names: Sequence[str]) -> Array:
-    """Standard deviation (p,) above which a parameter is not worth identifying; infinite for terms and loads."""
-    variables = kernel.variables(theta, poses)
+def plausible_limits(model: RobotModel, moments: Array, names: Sequence[str]) -> Array:
+    """Standard deviation (p,) above which a parameter is not worth identifying; infinite for base, tool, terms, loads.
+
+    ``moments`` are the poses' moments (n, m) in the order of :func:`robcal.robot.statics.moment_names`.
+    """
+    largest = dict(zip(moment_names(model), np.abs(moments).max(axis=0, initial=0.0), strict=True))
     limits = np.full(len(names), np.inf)
-    frames = {f.name for f in kernel.model.frames}
+    frames = {f.name for f in model.frames}
     for k, name in enumerate(names):
         frame, _, kind = name.rpartition(".")
         if frame not in frames:
@@ -109,8 +112,8 @@ def plausible_limits(kernel: Kernel, theta: Array, poses: PoseInputs, names: Seq
         elif kind in ("roll", "pitch", "yaw"):
             limits[k] = PLAUSIBLE_ANGLE
         else:
-            moment = variables[f"{identifier(frame)}_m{kind.removeprefix('elastic_')}"]
-            limits[k] = PLAUSIBLE_ANGLE / max(float(np.abs(moment).max(initial=0.0)), 1e-9)
+            moment = largest[f"{identifier(frame)}_m{kind.removeprefix('elastic_')}"]
+            limits[k] = PLAUSIBLE_ANGLE / max(float(moment), 1e-9)
     return limits
 
 

@@ -25,7 +25,7 @@ from robcal.calibration.identifiability import (
     plausible_limits,
 )
 from robcal.calibration.observations import FrameObservations, Observations, Stack, basis_points
-from robcal.calibration.problem import Problem, State, joint_scatter, whitening
+from robcal.calibration.problem import Evaluator, Problem, State, whitening
 from robcal.calibration.start_values import candidates
 from robcal.errors import InvalidInput, NotIdentifiable
 from robcal.least_squares import (
@@ -72,7 +72,7 @@ class IdentifyOptions:
     joint_sigma: float | Sequence[float] | None = None
     priors: Mapping[str, float] = field(default_factory=dict)
     covariance: Literal["auto", "stated", "estimated"] = "auto"
-    termination: TerminationSettings = TerminationSettings()
+    termination: TerminationSettings = field(default_factory=TerminationSettings)
 
 
 @dataclass(frozen=True)
@@ -178,33 +178,35 @@ def identify(
     if options.objective == "basis":
         observations = [basis_points(o) if isinstance(o, FrameObservations) else o for o in observations]
     stack = Stack(observations, len(poses))
-    state = start_state(kernel, poses, observations, stack)
+    evaluator = Evaluator(kernel, poses, stack)
+    state = start_state(evaluator, observations)
     choice = choose_candidates(model, options.parameters)
     for name in (*choice.names, *options.priors):
         if name not in kernel.index:
             raise InvalidInput(f"robot '{model.name}' has no parameter '{name}'")
 
-    engine = _Engine(kernel, poses, stack, options, choice)
+    engine = _Engine(evaluator, options, choice)
     outliers: list[int] = []
     weights = np.ones(len(poses))
     first = engine.solve(state, weights)
     if options.robust:
         suspects = _outliers(first, stack)
         if suspects:
-            outliers, weights, first = _without_outliers(engine, state, suspects, stack)
+            outliers, weights, first = _without_outliers(engine, first.state, suspects, stack)
     final = engine.choose(first, weights) if choice.own_axis or choice.cross_axis else first
     return _result(engine, final, weights, outliers, clock, seconds_kernel)
 
 
-def start_state(kernel: Kernel, poses: PoseInputs, observations: Sequence[Observations], stack: Stack) -> State:
+def start_state(evaluator: Evaluator, observations: Sequence[Observations]) -> State:
     """State with the kernel's own parameters and base and tool constructed from the data; the best of all candidates.
 
     Raises
     ------
     NotIdentifiable : nothing can be constructed and the model gives no references.
     """
+    kernel = evaluator.kernel
     theta = kernel.theta0
-    base_T_flange = kernel.with_references(np.eye(4), np.eye(4)).frames(theta, poses)
+    base_T_flange = kernel.with_references(np.eye(4), np.eye(4)).evaluate(theta, evaluator.poses)[0]
     pairs = candidates(base_T_flange, observations)
     if kernel.model.world_T_base is not None and kernel.model.flange_T_tool is not None:
         pairs.append((kernel.world_T_base, kernel.flange_T_tool))
@@ -220,8 +222,7 @@ def start_state(kernel: Kernel, poses: PoseInputs, observations: Sequence[Observ
     best: tuple[float, State] | None = None
     for pair in pairs:
         state = State(theta, *pair)
-        T = kernel.with_references(*pair).frames(theta, poses)
-        problem = Problem(kernel, poses, stack, ends, whitening(stack, T))
+        problem = Problem(evaluator, ends, whitening(evaluator, state))
         try:
             state, summary = gauss_newton(
                 problem.linearise, problem.residuals, problem.retract, state, TerminationSettings(15, 6, 1e-3)
@@ -250,39 +251,46 @@ class _Engine:
     """Elimination, iteration and choice for one set of data."""
 
     def __init__(
-        self, kernel: Kernel, poses: PoseInputs, stack: Stack, options: IdentifyOptions, choice: Candidates
+        self, evaluator: Evaluator, options: IdentifyOptions, choice: Candidates
     ) -> None:
-        self.kernel, self.poses, self.stack, self.options, self.choice = kernel, poses, stack, options, choice
-        self.priors = {kernel.index[name]: s for name, s in options.priors.items()}
+        self.evaluator, self.options, self.choice = evaluator, options, choice
+        self.kernel, self.poses, self.stack = evaluator.kernel, evaluator.poses, evaluator.stack
+        self.scatter = 1.0
+        self.priors = {self.kernel.index[name]: s for name, s in options.priors.items()}
 
     def columns(self, names: Sequence[str]) -> list[int]:
         return [self.kernel.index[n] for n in names]
 
     def problem(self, state: State, names: Sequence[str], weights: Array) -> Problem:
-        T = self.kernel.with_references(state.world_T_base, state.flange_T_tool).frames(state.theta, self.poses)
-        scatter = None
-        if self.options.joint_sigma is not None:
-            scatter = joint_scatter(self.kernel, state, self.poses, self.options.joint_sigma)
-        W = whitening(self.stack, T, scatter)
-        return Problem(self.kernel, self.poses, self.stack, self.columns(names), W, weights, self.priors)
+        W = whitening(self.evaluator, state, self.options.joint_sigma)
+        return Problem(self.evaluator, self.columns(names), W, weights, self.priors)
 
     def solve(self, state: State, weights: Array, names: Sequence[str] | None = None) -> _Solution:
         """Eliminate, iterate, and look again at the solution whether the elimination still holds."""
         names = (*self.choice.forced, *self.choice.own_axis) if names is None else tuple(names)
         iterations = 0
-        kept, eliminated = self._eliminate(self.problem(state, names, weights), state, names)
-        while True:
+        kept, eliminated = self._eliminate(state, names, weights)
+        for round_ in range(4):
             problem = self.problem(state, kept, weights)
             state, summary = gauss_newton(
                 problem.linearise, problem.residuals, problem.retract, state, self.options.termination
             )
             iterations += summary.iterations
-            again, eliminated = self._eliminate(self.problem(state, names, weights), state, names)
-            lost, won = set(kept) - set(again), set(again) - set(kept)
-            if not (lost or won) or iterations > 3 * self.options.termination.max_iterations:
-                return _Solution(problem, state, tuple(kept), eliminated, {}, summary, iterations)
-            state = self._reset(state, [n for n in lost if not n.startswith(("base.", "tool."))])
+            # After a fit the data's own scatter tells how far the stated covariance can be trusted.
+            rows = int(weights.astype(bool) @ self.stack.used.sum(axis=1))
+            self.scatter = max(1.0, float(np.sqrt(2.0 * summary.cost / max(1, rows - len(kept)))))
+            # Deviations make some parameters visible that are dependent at nominal (parallel axes), and hide others.
+            # Only the first look adds any; later ones only take away, so nothing can go round in circles.
+            if round_ == 3:
+                break
+            again, eliminated = self._eliminate(state, names if round_ == 0 else kept, weights, eliminated)
+            lost = [n for n in kept if n not in again and not n.startswith(("base.", "tool."))]
+            if again == kept:
+                break
+            if lost:
+                state = self._reset(state, lost)
             kept = again
+        return _Solution(problem, state, tuple(kept), eliminated, {}, summary, iterations)
 
     def choose(self, solution: _Solution, weights: Array) -> _Solution:
         """Choose among the elasticities at a solution and iterate with those that stay."""
@@ -320,16 +328,19 @@ class _Engine:
         return State(theta, state.world_T_base, state.flange_T_tool)
 
     def _limits(self, state: State, names: Sequence[str]) -> Array:
-        return plausible_limits(self.kernel, state.theta, self.poses, names)
+        return plausible_limits(self.kernel.model, self.evaluator(state).moments, names) / self.scatter
 
     def _eliminate(
-        self, problem: Problem, state: State, names: Sequence[str]
+        self, state: State, names: Sequence[str], weights: Array, before: Mapping[str, Eliminated] | None = None
     ) -> tuple[list[str], dict[str, Eliminated]]:
-        _, J = problem.linearise(state)
+        """Names that stay, in order, and all that were eliminated, those of ``before`` included."""
+        _, J = self.problem(state, names, weights).linearise(state)
         kept, gone = split_dependent(J.T @ J, names, self._limits(state, names))
         if not kept:
             raise NotIdentifiable("the measurements do not depend on any parameter of the robot", names)
-        return [names[k] for k in kept], {e.name: e for e in gone}
+        stay = [names[k] for k in kept]
+        old = {n: e for n, e in (before or {}).items() if n not in stay}
+        return stay, old | {e.name: e for e in gone}
 
 
 def _pose_statistics(solution: _Solution, weights: Array, stack: Stack) -> tuple[Array, Array, Array, Array]:

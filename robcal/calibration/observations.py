@@ -2,7 +2,7 @@
 
 Every operator gives, for tool frames ``T = world_T_tool`` (n, 4, 4) of all poses, residuals ``r = measured - model``
 (m, d), the derivative ``B`` (m, d, 6) of the model by a right twist (rho, omega) of the tool, and a covariance
-(m, d, d). So one solver serves 6D frames, 3D points, 1D distances, a sensor in the hand, and raw pixels, alone or mixed.
+(m, d, d). So one solver serves 6D frames, 3D points, 1D distances, a sensor in the hand, and raw pixels, also mixed.
 """
 
 from __future__ import annotations
@@ -349,7 +349,7 @@ class Stack:
         self.slots: list[tuple[Ints, Ints]] = []
         for o in self.observations:
             if len(o.pose) and int(o.pose.max()) >= n_poses:
-                raise InvalidInput(f"an observation belongs to pose {int(o.pose.max())}, there are only {n_poses} poses")
+                raise InvalidInput(f"an observation belongs to pose {int(o.pose.max())}, there are {n_poses} poses")
             order = np.argsort(o.pose, kind="stable")
             counts = np.bincount(o.pose, minlength=n_poses)
             rank = np.empty(len(o.pose), dtype=np.int64)

@@ -29,40 +29,74 @@ class State:
     flange_T_tool: Array
 
 
+@dataclass(frozen=True)
+class Evaluation:
+    """Everything the kernel and the operators say at a state: raw, for all parameters.
+
+    Attributes
+    ----------
+    T : (n, 4, 4); J : (n, 6, all parameters); moments : (n, m); r, B : stacked residuals (n, D) and (n, D, 6).
+    """
+
+    T: Array
+    J: Array
+    moments: Array
+    r: Array
+    B: Array
+
+
+class Evaluator:
+    """Kernel and observations at one set of poses, remembering the last states: most are asked for several times."""
+
+    def __init__(self, kernel: Kernel, poses: PoseInputs, stack: Stack) -> None:
+        self.kernel, self.poses, self.stack = kernel, poses, stack
+        self._memory: list[tuple[State, Evaluation]] = []
+
+    def __call__(self, state: State) -> Evaluation:
+        """The evaluation at a state."""
+        for known, evaluation in self._memory:
+            if known is state:
+                return evaluation
+        at = self.kernel.with_references(state.world_T_base, state.flange_T_tool)
+        T, J, moments = at.evaluate(state.theta, self.poses)
+        stacked = self.stack.evaluate(T)
+        evaluation = Evaluation(T, J, moments, stacked.r, stacked.B)
+        self._memory = [(state, evaluation), *self._memory[:2]]
+        return evaluation
+
+
 class Problem:
     """Residuals of all observations at all poses.
 
     Parameters
     ----------
-    kernel, poses, stack : model, inputs (n), observations arranged by pose.
+    evaluator : kernel, poses (n) and observations.
     columns : indices of the free parameters.
-    whitener : (n, D, D) lower-triangular inverse Cholesky factors of the poses' covariances.
+    whitener : (n, D, D) inverse Cholesky factors of the poses' covariances.
     weights : (n,) further weights of the poses (0 leaves a pose out).
-    prior : mean zero standard deviations by parameter index (information rows), or None.
+    prior : standard deviations around zero by parameter index (information rows), or None.
     """
 
     def __init__(
-        self, kernel: Kernel, poses: PoseInputs, stack: Stack, columns: ArrayLike, whitener: Array,
+        self, evaluator: Evaluator, columns: ArrayLike, whitener: Array,
         weights: Array | None = None, prior: Mapping[int, float] | None = None,
     ) -> None:
-        self.kernel, self.poses, self.stack = kernel, poses, stack
+        self.evaluator = evaluator
+        self.kernel, self.poses, self.stack = evaluator.kernel, evaluator.poses, evaluator.stack
         self.columns = np.asarray(columns, dtype=np.intp)
         self.plain_whitener = whitener
         self.whitener = whitener if weights is None else whitener * np.sqrt(weights)[:, None, None]
-        self.prior = {k: s for k, s in (prior or {}).items() if k in set(self.columns.tolist())}
-        self._prior_at = [int(np.flatnonzero(self.columns == k)[0]) for k in self.prior]
-        self._base = [kernel.index[f"base.{k}"] for k in GEOMETRIC_KINDS]
-        self._tool = [kernel.index[f"tool.{k}"] for k in GEOMETRIC_KINDS]
-        self._all_used = bool(stack.used.all())
-
-    def frames(self, state: State) -> Array:
-        """Tool frames (n, 4, 4) at a state."""
-        return self._at(state).frames(state.theta, self.poses)
+        at = {int(k): row for row, k in enumerate(self.columns)}
+        self.prior = {k: s for k, s in (prior or {}).items() if k in at}
+        self._prior_at = [at[k] for k in self.prior]
+        self._base = [self.kernel.index[f"base.{k}"] for k in GEOMETRIC_KINDS]
+        self._tool = [self.kernel.index[f"tool.{k}"] for k in GEOMETRIC_KINDS]
+        self._all_used = bool(self.stack.used.all())
 
     def residuals(self, state: State) -> Array:
         """Whitened residuals (rows,)."""
-        r = self.stack.evaluate(self.frames(state)).r
-        return self._with_prior(self._flat(np.einsum("nij,nj->ni", self.whitener, r)), state)
+        r = np.einsum("nij,nj->ni", self.whitener, self.evaluator(state).r)
+        return self._with_prior(self._flat(r), state)
 
     def linearise(self, state: State) -> tuple[Array, Array]:
         """Whitened residuals (rows,) and Jacobian (rows, p)."""
@@ -77,9 +111,9 @@ class Problem:
 
     def blocks(self, state: State) -> tuple[Array, Array]:
         """Whitened residuals (n, D) and Jacobian (n, D, p) by pose, zero where padded; priors left out."""
-        T, J = self._at(state).frames_and_jacobian(state.theta, self.poses, self.columns)
-        stacked = self.stack.evaluate(T)
-        return np.einsum("nij,nj->ni", self.whitener, stacked.r), (self.whitener @ stacked.B) @ J
+        at = self.evaluator(state)
+        r = np.einsum("nij,nj->ni", self.whitener, at.r)
+        return r, (self.whitener @ at.B) @ at.J[:, :, self.columns]
 
     def retract(self, state: State, step: Array) -> State:
         """Add a step to the free parameters and fold base and tool into their references."""
@@ -95,21 +129,7 @@ class Problem:
 
     def unweighted(self) -> Problem:
         """The same problem with all poses at full weight, those left out included."""
-        other = self.with_columns(self.columns)
-        other.whitener = self.plain_whitener
-        return other
-
-    def with_columns(self, columns: ArrayLike) -> Problem:
-        """The same problem with other free parameters."""
-        other = object.__new__(Problem)
-        other.__dict__.update(self.__dict__)
-        other.columns = np.asarray(columns, dtype=np.intp)
-        other.prior = {k: s for k, s in self.prior.items() if k in set(other.columns.tolist())}
-        other._prior_at = [int(np.flatnonzero(other.columns == k)[0]) for k in other.prior]
-        return other
-
-    def _at(self, state: State) -> Kernel:
-        return self.kernel.with_references(state.world_T_base, state.flange_T_tool)
+        return Problem(self.evaluator, self.columns, self.plain_whitener, None, self.prior)
 
     def _flat(self, r: Array) -> Array:
         return r.ravel() if self._all_used else r[self.stack.used]
@@ -120,20 +140,20 @@ class Problem:
         return np.concatenate([r, [-state.theta[k] / s for k, s in self.prior.items()]])
 
 
-def whitening(stack: Stack, T: Array, joint_covariance: Array | None = None) -> Array:
-    """Whiteners (n, D, D): inverse Cholesky factors of each pose's covariance.
+def whitening(evaluator: Evaluator, state: State, joint_sigma: ArrayLike | None = None) -> Array:
+    """Whiteners (n, D, D): inverse Cholesky factors of each pose's covariance at a state.
 
     Parameters
     ----------
-    T : (n, 4, 4) tool frames at which covariances and derivatives are taken.
-    joint_covariance : (n, 6, 6) covariance of the tool's twist that all rows of a pose have in common (repeatability
-        of the joints), added as ``B S B'``.
+    joint_sigma : repeatability of the joints (one number or (N,), rad or m): scatter that all rows of a pose have in
+        common, added as ``B S B'``.
     """
-    C = stack.covariance(T)
-    if joint_covariance is not None:
-        C = C + tf.transport_covariance(stack.evaluate(T).B, joint_covariance)
+    at = evaluator(state)
+    C = evaluator.stack.covariance(at.T)
+    if joint_sigma is not None:
+        C = C + tf.transport_covariance(at.B, joint_scatter(evaluator.kernel, state, evaluator.poses, joint_sigma))
     L = np.linalg.cholesky(C)
-    return np.linalg.solve(L, np.broadcast_to(np.eye(L.shape[-1]), L.shape))
+    return np.asarray(np.linalg.solve(L, np.broadcast_to(np.eye(L.shape[-1]), L.shape)))
 
 
 def joint_scatter(kernel: Kernel, state: State, poses: PoseInputs, joint_sigma: ArrayLike) -> Array:

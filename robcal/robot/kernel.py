@@ -171,11 +171,14 @@ class Kernel:
         self, theta: ArrayLike, poses: PoseInputs, columns: ArrayLike | None = None
     ) -> tuple[Array, Array]:
         """Tool frames (n, 4, 4) and right twists (n, 6, p) per parameter; ``columns`` picks parameters by index."""
-        flat, jacobian = self._evaluate("jacobian", theta, poses)
+        T, J, _ = self.evaluate(theta, poses)
+        return T, J if columns is None else J[:, :, np.asarray(columns)]
+
+    def evaluate(self, theta: ArrayLike, poses: PoseInputs) -> tuple[Array, Array, Array]:
+        """Tool frames (n, 4, 4), right twists (n, 6, p) of all parameters, and moments (n, m), in one call."""
+        flat, jacobian, moments = self._evaluate("jacobian", theta, poses)
         J = jacobian.reshape(len(poses), len(self.names), 6)
-        if columns is not None:
-            J = J[:, np.asarray(columns)]
-        return _matrices(flat), J.transpose(0, 2, 1)
+        return _matrices(flat), J.transpose(0, 2, 1), moments
 
     def joint_jacobian(self, theta: ArrayLike, poses: PoseInputs) -> Array:
         """Right twist (n, 6, N) of the tool per unit of each joint."""
@@ -221,7 +224,8 @@ class Kernel:
         return theta
 
     def function(self, kind: str = "frames") -> ca.Function:
-        """CasADi function of one pose: 'frames', 'jacobian' (with frames), 'joint_jacobian', 'basis' or 'moments'.
+        """CasADi function of one pose: 'frames', 'jacobian' (frames, Jacobian, moments), 'joint_jacobian', 'basis' or
+        'moments'.
 
         Inputs: theta, q, load, covariates, world_T_base (3, 4), flange_T_tool (3, 4).
         """
@@ -229,7 +233,7 @@ class Kernel:
             g = self.graph()
             outputs = {
                 "frames": [g.world_T_tool],
-                "jacobian": [g.world_T_tool, g.jacobian],
+                "jacobian": [g.world_T_tool, g.jacobian, g.moments],
                 "joint_jacobian": [g.joint_jacobian],
                 "basis": [g.basis],
                 "moments": [g.moments],
