@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from robcal.imaging.edge_model import axes_from_matrix, matrix_from_axes
+from robcal.imaging.edge_model import axes_from_matrix, edge_distance, matrix_from_axes
 from robcal.imaging.ellipse_fit import EllipseFits, evaluate, free_shading, iterate, outliers, start
-from robcal.imaging.noise import NoiseModel, with_gain
+from robcal.imaging.noise import NoiseModel, correlation_factor, with_gain
 from robcal.imaging.ring_code import RingReadings, ring_glare
 from robcal.imaging.segmentation import Candidates
 from robcal.imaging.windows import Windows, gather_windows
@@ -23,7 +23,8 @@ Array = NDArray[np.float64]
 
 _PIXEL_VARIANCE = 1.0 / 12.0
 # systematic part of the centre that no noise covers (model misfit, pixel response), px; see edge_model
-_FLOOR_EDGE, _FLOOR_SPOT = 0.002, 0.008
+_FLOOR_EDGE, _FLOOR_SPOT = 0.001, 0.006
+_SHADING_TOLD = 0.02  # sigma of a dot's relative gradient per radius above which it cannot tell shading from shift
 _SPOT_RATIO, _SPOT_RATIO_ROUND = 1.7, 1.2  # minor semi-axis by s below which a tilted, a round dot is a spot
 
 
@@ -92,7 +93,9 @@ def fit_dots(
     groups = gather_windows(image, candidates, saturation)
     fits = [iterate(_start(candidates, window), window, noise, 12, tolerance=0.2) for window in groups]
     noise = _noise_inside(groups, fits, noise)
+    fits = [iterate(fit, window, noise, 2, tolerance=0.05) for window, fit in zip(groups, fits, strict=True)]
     shading, prior = _shading(groups, fits)
+    noise = replace(noise, correlation=_correlation(groups, fits))
     results = []
     for window, fit in zip(groups, fits, strict=True):
         results.append(_finish(fit, window, noise, shading[window.index], candidates))
@@ -131,35 +134,59 @@ def _start(candidates: Candidates, window: Windows) -> EllipseFits:
 
 
 def _noise_inside(groups: list[Windows], fits: list[EllipseFits], noise: NoiseModel) -> NoiseModel:
-    """The noise model with the gain seen inside the dots, where enough pixels lie well inside."""
-    grey, variance = [], []
+    """The noise model with the gain seen on the bright pixels of the dots, by residuals and their redundancy."""
+    grey, variance, weights = [], [], []
     for window, fit in zip(groups, fits, strict=True):
-        inside = window.inside & (fit.weight > 0)
-        use = np.flatnonzero(fit.converged & (inside.sum(axis=1) >= 12))
+        use = np.flatnonzero(fit.converged)
         if use.size == 0:
             continue
-        count = inside[use].sum(axis=1)
-        squares = np.where(inside[use], fit.residual[use] ** 2, 0.0).sum(axis=1)
-        mean = np.where(inside[use], window.value[use], 0.0).sum(axis=1) / count
-        # one to three parameters (contrast and its gradient) are taken from these pixels
-        variance.append(squares / (count - 1.0 - 2.0 * (fit.shading_sigma[use] > 0)))
-        grey.append(mean)
+        part, chosen = window.take(use), fit.take(use)
+        model, jacobian = evaluate(chosen.parameters, part, chosen.is_spot)
+        inverse = chosen.covariance()
+        inverse[~np.isfinite(inverse)] = 0.0
+        leverage = chosen.weight * np.einsum("npi,npi->np", np.matmul(jacobian, inverse), jacobian)
+        half = chosen.parameters[:, 6, None] + 0.6 * chosen.parameters[:, 9, None]
+        bright = (chosen.weight > 0) & (model > half)
+        free = np.where(bright, np.clip(1.0 - leverage, 0.0, 1.0), 0.0)
+        redundancy = free.sum(axis=1)
+        enough = redundancy > 0.1
+        squares = np.where(bright, chosen.residual**2, 0.0).sum(axis=1)
+        variance.append((squares / np.maximum(redundancy, 1e-9))[enough])
+        grey.append(((free * model).sum(axis=1) / np.maximum(redundancy, 1e-9))[enough])
+        weights.append(redundancy[enough])
     if not grey:
         return noise
-    return with_gain(noise, np.concatenate(grey), np.concatenate(variance))
+    return with_gain(noise, np.concatenate(grey), np.concatenate(variance), np.concatenate(weights))
+
+
+def _correlation(groups: list[Windows], fits: list[EllipseFits]) -> float:
+    """Noise correlation from the residuals of neighbouring background pixels (rows are in reading order)."""
+    products, squares, count = 0.0, 0.0, 0
+    for window, fit in zip(groups, fits, strict=True):
+        background = (fit.weight > 0) & ~window.inside & fit.converged[:, None]
+        background &= edge_distance(fit.parameters, window.x, window.y)[0] > 2.4 * np.exp(fit.parameters[:, 5, None])
+        pair = background[:, :-1] & background[:, 1:]
+        pair &= (window.x[:, 1:] - window.x[:, :-1] == 1) & (window.y[:, 1:] == window.y[:, :-1])
+        normalised = np.where(fit.weight > 0, fit.residual * np.sqrt(fit.weight), 0.0)
+        normalised = np.clip(normalised, -4.0, 4.0)
+        products += float((normalised[:, :-1] * normalised[:, 1:])[pair].sum())
+        squares += float(0.5 * (normalised[:, :-1] ** 2 + normalised[:, 1:] ** 2)[pair].sum())
+        count += int(pair.sum())
+    return correlation_factor(products / squares) if count >= 300 and squares > 0 else 1.0
 
 
 def _shading(groups: list[Windows], fits: list[EllipseFits]) -> tuple[Array, float]:
-    """Prior sigma of each dot's relative gain gradient per radius, (n,), and the common one of the image."""
+    """Prior sigma of each dot's relative gain gradient per radius, (n,), and the common one of the image, per px."""
     n = sum(len(window.index) for window in groups)
-    square, variance, good = np.zeros(n), np.ones(n), np.zeros(n, bool)
+    square, variance, good, radius = np.zeros(n), np.ones(n), np.zeros(n, bool), np.ones(n)
     for window, fit in zip(groups, fits, strict=True):
         gradient, expected = free_shading(fit)
         dof = np.maximum((fit.weight > 0).sum(axis=1) - 10, 1)
         chi2 = np.einsum("np,np,np->n", fit.weight, fit.residual, fit.residual) / dof
-        square[window.index] = 0.5 * (gradient**2).sum(axis=1)
-        variance[window.index] = expected * np.maximum(chi2, 1.0)
-        good[window.index] = fit.converged & (chi2 < 50.0)
+        rows = window.index
+        square[rows] = 0.5 * (gradient**2).sum(axis=1) / window.radius**2
+        variance[rows] = expected * np.maximum(chi2, 1.0) / window.radius**2
+        good[rows], radius[rows] = (chi2 < 50.0) & (expected < _SHADING_TOLD**2), window.radius
     common = 0.0
     if good.any():
         s, v = square[good], variance[good]
@@ -167,9 +194,9 @@ def _shading(groups: list[Windows], fits: list[EllipseFits]) -> tuple[Array, flo
         for _ in range(8):
             weight = 1.0 / (v[keep] + common) ** 2
             common = max(0.0, float((weight * (s[keep] - v[keep])).sum() / weight.sum()))
-    # a single dot with a gradient beyond what is usual here (99.9 % of two normal numbers) is left free
-    unusual = square > 6.9 * (variance + common)
-    return np.sqrt(np.where(unusual, square, common)), float(np.sqrt(common))
+    # a dot with a gradient beyond what is usual here (99.9 % of two normal numbers) is left free, if it can tell at all
+    unusual = (square > 6.9 * (variance + common)) & (variance * radius**2 < _SHADING_TOLD**2)
+    return radius * np.sqrt(np.where(unusual, square, common)), float(np.sqrt(common))
 
 
 def _finish(fit: EllipseFits, window: Windows, noise: NoiseModel, shading: Array, candidates: Candidates) -> dict:
@@ -191,8 +218,7 @@ def _as_spots(
     fit: EllipseFits, window: Windows, noise: NoiseModel, rows: NDArray, prior_blur: Array, dropped: NDArray
 ) -> EllipseFits:
     """Replaces the fits of `rows` by Gaussian spots of the same second moments."""
-    chosen = Windows(*(getattr(window, name)[rows] for name in Windows.__dataclass_fields__))
-    old = EllipseFits(*(getattr(fit, name)[rows] for name in EllipseFits.__dataclass_fields__))
+    chosen, old = window.take(rows), fit.take(rows)
     semi_axes, angle = axes_from_matrix(old.parameters[:, 2:5])
     parameters = old.parameters.copy()
     second = np.sqrt(np.exp(2.0 * parameters[:, 5, None]) + semi_axes**2 / 4.0)
@@ -219,7 +245,7 @@ def _columns(fit: EllipseFits, window: Windows, noise: NoiseModel) -> dict:
     safe = np.maximum(np.abs(contrast), 1e-6)
     # beyond its own scatter chi2 tells of misfit or underestimated noise; correlated noise counts by its block means
     excess = np.where(chi2 > 1.0 + 3.0 * np.sqrt(2.0 / dof), chi2, 1.0)
-    covariance = inverse[:, :2, :2] * np.maximum(excess, noise.correlation)[:, None, None]
+    covariance = inverse[:, :2, :2] * (excess * noise.correlation)[:, None, None]
     floor = np.where(fit.is_spot, _FLOOR_SPOT, _FLOOR_EDGE)
     covariance = covariance + floor[:, None, None] ** 2 * np.eye(2)
     s = np.exp(parameters[:, 5])

@@ -48,6 +48,10 @@ class EllipseFits:
     residual: Array
     shading_sigma: Array
 
+    def take(self, chosen: NDArray) -> EllipseFits:
+        """The chosen rows."""
+        return EllipseFits(*(getattr(self, name)[chosen] for name in EllipseFits.__dataclass_fields__))
+
     def covariance(self) -> Array:
         """(n, 12, 12) inverse of the normal matrices; infinite centre variances where they are singular."""
         scale = 1.0 / np.sqrt(np.maximum(np.diagonal(self.normal, axis1=1, axis2=2), 1e-300))
@@ -180,8 +184,8 @@ def iterate(
         trial[:, 5] = np.clip(trial[:, 5], np.log(0.28), np.log(np.maximum(windows.radius[active], 1.0) * 2.0))
         definite = (trial[:, 2] * trial[:, 4] > trial[:, 3] ** 2) & (trial[:, 2] > 0) & np.isfinite(trial).all(axis=1)
         trial[~definite] = parameters[active[~definite]]
-        sub = _take(windows, active)
-        new = _system(trial, prior[active], sub, _take_fits(fits, active), noise, dropped[active])
+        sub = windows.take(active)
+        new = _system(trial, prior[active], sub, fits.take(active), noise, dropped[active])
         # weights follow the model: compare both costs by the new weights within the noise of that change
         better = definite & (new.cost <= cost[active] * (1 + 1e-9) + 1e-9)
         accepted = active[better]
@@ -210,18 +214,6 @@ def _solve(normal: Array, right: Array, damping: Array, is_spot: NDArray[np.bool
     step = np.linalg.solve(scaled, (right * scale)[..., None])[..., 0] * scale
     step[is_spot, 5] = 0.0
     return step
-
-
-def _take(windows: Windows, chosen: NDArray) -> Windows:
-    if len(chosen) == len(windows.index):
-        return windows
-    return Windows(*(getattr(windows, name)[chosen] for name in Windows.__dataclass_fields__))
-
-
-def _take_fits(fits: EllipseFits, chosen: NDArray) -> EllipseFits:
-    if len(chosen) == len(fits.parameters):
-        return fits
-    return EllipseFits(*(getattr(fits, name)[chosen] for name in EllipseFits.__dataclass_fields__))
 
 
 def free_shading(fits: EllipseFits) -> tuple[Array, Array]:

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-_TILE = 36  # px; divisible by 3 for the block means
-_TILES_MAX = 500
+_TILE = 12  # px; three by three blocks of four
+_TILES_MAX = 3000
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class NoiseModel:
     variance : at the grey value `level` (read noise, quantisation, and shot noise there).
     gain : shot noise, grey values per electron; 0 where the image does not tell.
     level : grey value of the dark ground of the image.
-    correlation : variance of block means by that of white noise, >= 1 (JPEG, demosaicing, sharpening).
+    correlation : variance of sums over neighbouring pixels by that of white noise, >= 1 (JPEG, demosaicing).
     step : quantisation step, grey values (4 for 14-bit data stretched to 16).
     """
 
@@ -54,94 +54,130 @@ def quantisation_step(image: NDArray) -> int:
 
 
 def _tiles(image: NDArray) -> Array:
-    """(k, size, size) tiles spread evenly over the image."""
+    """(k, 12, 12) tiles spread evenly over the image."""
     height, width = image.shape
-    size = min(_TILE, height - height % 3, width - width % 3)
-    rows, columns = height // size, width // size
+    rows, columns = height // _TILE, width // _TILE
     step = max(1, int(np.ceil(np.sqrt(rows * columns / _TILES_MAX))))
-    return np.stack(
-        [
-            image[r * size : (r + 1) * size, c * size : (c + 1) * size]
-            for r in range(0, rows, step)
-            for c in range(0, columns, step)
-        ]
-    ).astype(float)
+    cut = image[: rows * _TILE, : columns * _TILE].reshape(rows, _TILE, columns, _TILE)[::step, :, ::step]
+    return cut.transpose(0, 2, 1, 3).reshape(-1, _TILE, _TILE).astype(float)
 
 
 def _high_pass_variance(tiles: Array) -> Array:
-    """(k,) variance by Immerkaer's mask, by the 68 % quantile of the absolute answers (robust to few edges)."""
+    """(k,) variance by Immerkaer's mask: mean square of its answers by the sum of its squared weights, 36."""
     second = tiles[:, :, 2:] - 2.0 * tiles[:, :, 1:-1] + tiles[:, :, :-2]
-    answer = np.abs(second[:, 2:] - 2.0 * second[:, 1:-1] + second[:, :-2]).reshape(len(tiles), -1)
-    # mean of the absolute values below their 80 % quantile: for a normal distribution 0.5569 sigma; unlike a
-    # quantile it is not itself quantised when the noise is about one grey value
-    answer.sort(axis=1)
-    kept = answer[:, : max(1, int(0.8 * answer.shape[1]))]
-    return (kept.mean(axis=1) / (6.0 * _TRIMMED_MEAN)) ** 2
+    answer = second[:, 2:] - 2.0 * second[:, 1:-1] + second[:, :-2]
+    return np.asarray((answer**2).mean(axis=(1, 2)) / 36.0)
 
 
-# E|z| below the 80 % quantile c = 1.28155 of |z|: 2 (phi(0) - phi(c)) / 0.8
-_TRIMMED_MEAN = 2.0 * (0.3989422804 - 0.1754983319) / 0.8
+def _block_variance(tiles: Array) -> Array:
+    """(k,) variance of the means of 4x4 blocks around the tile's plane, times 16: that of a pixel for white noise."""
+    means = tiles.reshape(len(tiles), 3, 4, 3, 4).mean(axis=(2, 4))
+    means = means - means.mean(axis=(1, 2), keepdims=True)
+    by_row = 0.5 * (means[:, 2] - means[:, 0]).mean(axis=1)
+    by_column = 0.5 * (means[:, :, 2] - means[:, :, 0]).mean(axis=1)
+    ramp = np.array([-1.0, 0.0, 1.0])
+    means = means - by_row[:, None, None] * ramp[:, None] - by_column[:, None, None] * ramp
+    return np.asarray((means**2).sum(axis=(1, 2)) * 16.0 / _BLOCK_DOF)
+
+
+_BLOCK_DOF = 6  # nine means, three parameters of the plane
+_CHI2_THIRD = 4.1973 / 6.0  # 35 % quantile of chi-square with six degrees of freedom, by six
 
 
 def estimate_noise(image: NDArray) -> NoiseModel:
     """Noise model of a grey image of shape (h, w), 8 or 16 bit.
 
+    Tiles are chosen by the flatness of their block means, which for white noise is independent of the high-pass
+    variance that is then averaged over them: choosing does not bias.
+
     Weakness: texture that fills the whole image counts as noise; the gain needs smooth areas of different grey
     values and is 0 otherwise (see :func:`with_gain`).
     """
     step = float(quantisation_step(image))
-    if min(image.shape) < 9:
-        return NoiseModel(max(float(np.var(image)) / 2.0, step**2 / 12.0), 0.0, float(np.median(image)), 1.0, step)
+    floor = step**2 / 12.0
+    if min(image.shape) < _TILE:
+        return NoiseModel(max(float(np.var(image)) / 2.0, floor), 0.0, float(np.median(image)), 1.0, step)
     tiles = _tiles(image)
     level = tiles.mean(axis=(1, 2))
     variance = _high_pass_variance(tiles)
-    # whole tiles at 0 or at the top of the range are clipped: no noise to be seen there
+    # tiles at 0 or at the top of the range are clipped: no noise to be seen there
     top = float(np.iinfo(image.dtype).max)
     usable = (level > 0.5 * step) & (level < 0.98 * top) & (variance > 0)
     if usable.sum() < 4:
-        return NoiseModel(step**2 / 12.0, 0.0, float(np.median(level)), 1.0, step)
+        return NoiseModel(floor, 0.0, float(np.median(level)), 1.0, step)
     tiles, level, variance = tiles[usable], level[usable], variance[usable]
-    # quieter half within each of up to 12 grey classes: texture only adds
-    order = np.argsort(level)
-    bins = np.array_split(order, min(12, max(1, len(order) // 12)))
-    quiet = [chosen[np.argsort(variance[chosen])[: max(2, int(np.ceil(0.6 * len(chosen))))]] for chosen in bins]
-    bin_level = np.array([level[chosen].mean() for chosen in quiet])
-    bin_variance = np.array([np.median(variance[chosen]) for chosen in quiet])
+    structure = _block_variance(tiles)
+    classes = np.array_split(np.argsort(level), min(12, max(1, len(level) // 40)))
+    flat = [chosen[np.argsort(structure[chosen])[: max(2, int(np.ceil(0.35 * len(chosen))))]] for chosen in classes]
+    bin_level = np.array([level[chosen].mean() for chosen in flat])
+    bin_variance = np.array([_trimmed_mean(variance[chosen]) for chosen in flat])
+    # a class in which even the flattest tiles have structure tells nothing
+    even = np.array([
+        np.median(structure[chosen]) < 4.0 * _CHI2_THIRD * max(float(np.median(variance[chosen])), floor)
+        for chosen in flat
+    ])  # fmt: skip
+    if even.any():
+        bin_level, bin_variance = bin_level[even], bin_variance[even]
     dark = float(np.median(level))
     gain = 0.0
-    if len(bins) >= 4 and np.ptp(bin_level) > 0.1 * top:
-        # Theil-Sen slope: robust to classes in which every tile is textured
-        i, j = np.triu_indices(len(bins), 1)
+    if len(bin_level) >= 4 and np.ptp(bin_level) > 0.1 * top:
+        # Theil-Sen slope: robust to single classes with texture
+        i, j = np.triu_indices(len(bin_level), 1)
         apart = (bin_level[j] - bin_level[i]) > 0.02 * top
-        if apart.any():
-            gain = max(0.0, float(np.median((bin_variance[j] - bin_variance[i])[apart] / (bin_level[j] - bin_level[i])[apart])))
-    at_dark = float(np.median(bin_variance - gain * (bin_level - dark)))
-    at_dark = max(at_dark, step**2 / 12.0)
-    return NoiseModel(at_dark, gain, dark, _correlation(tiles, variance, step), step)
+        slopes = (bin_variance[j] - bin_variance[i])[apart] / (bin_level[j] - bin_level[i])[apart]
+        gain = max(0.0, float(np.median(slopes))) if len(slopes) else 0.0
+    at_dark = max(float(np.median(bin_variance - gain * (bin_level - dark))), floor)
+    return NoiseModel(at_dark, gain, dark, 1.0, step)
 
 
-def _correlation(tiles: Array, variance: Array, step: float) -> float:
-    """Variance of 3x3 block means times 9 by the pixels' variance, on the quietest tiles; 1 for white noise."""
-    blocks = tiles.shape[1] // 3
-    if blocks < 6:
-        return 1.0
-    means = tiles.reshape(len(tiles), blocks, 3, blocks, 3).mean(axis=(2, 4))
-    ratio = 9.0 * _high_pass_variance(means) / np.maximum(variance, step**2 / 12.0)
-    typical = float(np.quantile(ratio, 0.25))
-    # sampling scatter of the quartile stays well below 1.3 for white noise; smooth structure raises it little
-    return min(typical, 16.0) if typical > 1.3 else 1.0
+def _trimmed_mean(values: Array) -> float:
+    """Mean without the highest and the lowest tenth."""
+    ordered = np.sort(values)
+    cut = len(ordered) // 10
+    return float(ordered[cut : len(ordered) - cut].mean())
 
 
-def with_gain(noise: NoiseModel, grey: Array, variance: Array) -> NoiseModel:
+def with_gain(noise: NoiseModel, grey: Array, variance: Array, weight: Array) -> NoiseModel:
     """The model with the gain from variances seen inside bright dots.
 
     Parameters
     ----------
-    grey, variance : (k,) mean grey value and residual variance of the inside of each dot.
+    grey, variance, weight : (k,) mean grey value and residual variance of the bright pixels of each dot, and the
+        number of free residuals behind it.
     """
     lift = np.asarray(grey, dtype=float) - noise.level
-    far = np.abs(lift) > 20.0 * noise.sigma
-    if far.sum() < 3:
+    use = (np.abs(lift) > 8.0 * noise.sigma) & (weight > 0)
+    if weight[use].sum() < 30.0:
         return noise
-    gain = max(0.0, float(np.median((np.asarray(variance)[far] - noise.variance) / np.abs(lift[far]))))
-    return NoiseModel(noise.variance, gain, noise.level, noise.correlation, noise.step)
+    grey_lift, found, count = _pooled(lift[use], np.asarray(variance)[use], np.asarray(weight)[use])
+    # weighted median: single dots with dirt do not count. The median of a mean of k squares lies below its
+    # expectation by the factor 1 - 2 / (9 k) cubed (Wilson and Hilferty)
+    gain = (found / (1.0 - 2.0 / (9.0 * count)) ** 3 - noise.variance) / grey_lift
+    order = np.argsort(gain)
+    cumulated = np.cumsum((count * np.abs(grey_lift))[order])
+    middle = float(gain[order][np.searchsorted(cumulated, 0.5 * cumulated[-1])])
+    positive = middle if noise.gain >= 0 else min(middle, 0.0)
+    return NoiseModel(noise.variance, max(positive, 0.0) if noise.gain >= 0 else positive, noise.level,
+                      noise.correlation, noise.step)  # fmt: skip
+
+
+def _pooled(lift: Array, variance: Array, weight: Array) -> tuple[Array, Array, Array]:
+    """Neighbours in brightness put together until each has at least four free residuals behind it."""
+    order = np.argsort(lift)
+    group = np.floor(np.cumsum(weight[order]) / 4.0).astype(int)
+    group = np.unique(group, return_inverse=True)[1]
+    total = np.bincount(group, weight[order])
+    return (
+        np.bincount(group, (weight * lift)[order]) / total,
+        np.bincount(group, (weight * variance)[order]) / total,
+        total,
+    )
+
+
+def correlation_factor(lag_one: float) -> float:
+    """Variance of sums over neighbouring pixels by that of white noise, from the correlation of direct neighbours.
+
+    Noise is taken as a separable first-order process, whose spectrum at long waves is ((1 + r) / (1 - r))^2 of white.
+    """
+    r = min(lag_one, 0.7)
+    return ((1.0 + r) / (1.0 - r)) ** 2 if r > 0.05 else 1.0

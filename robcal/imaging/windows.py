@@ -36,6 +36,12 @@ class Windows:
     inside: NDArray[np.bool_]
     saturated: NDArray[np.bool_]
 
+    def take(self, chosen: NDArray) -> Windows:
+        """The chosen rows."""
+        if len(chosen) == len(self.index) and np.array_equal(chosen, np.arange(len(chosen))):
+            return self
+        return Windows(*(getattr(self, name)[chosen] for name in Windows.__dataclass_fields__))
+
 
 def _dilate(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """3x3 dilation over the last two axes."""
