@@ -44,7 +44,7 @@ def diagnose(
         noise = estimate_noise(model, chosen.recording, free, chosen.accepted)
     before = fit(model, chosen.recording, free)
     final = chosen.last.fit
-    findings = _findings(model, chosen, free, tied, verify, before)
+    findings = _findings(model, chosen, chosen.free, chosen.tied, verify, before)
     heldout = _heldout(chosen.recording, before, final, verify, noise)
     poses: tuple[dict[str, float], ...] = ()
     for finding in findings:

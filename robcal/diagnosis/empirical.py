@@ -13,6 +13,7 @@ import numpy as np
 
 from robcal.physics.family import Basis, Constants, Family
 from robcal.physics.site import LETTER_OF_KIND, Joint, RobotSite
+from robcal.robot.terms import identifier
 from robcal.transforms import Array
 
 BUMPS = (4, 7, 12)
@@ -30,6 +31,8 @@ def empirical_families(site: RobotSite) -> Iterator[Family]:
         for kind in kinds:
             own = [f"q{joint.number}", f"torque{joint.number}"]
             others = [f"q{other.number}" for other in joints if other.number != joint.number]
+            if kind != "q":
+                own.append(f"{identifier(joint.frame)}_m{kind}")
             covariates = own + (others if kind == "q" else []) + ["index"] * (kind == "q")
             covariates += ["time_s"] * (kind == "q") + list(site.temperatures() if kind == "q" else ())
             for covariate in covariates:

@@ -19,6 +19,13 @@ from robcal.robot.model import RobotModel
 from robcal.transforms import Array
 
 
+PLAUSIBLE_ELASTICITY = 3e-6
+PLAUSIBLE_DEVIATION = 1e-3
+"""rad/(N m); m or rad: deviations that robots have."""
+VISIBLE_SIGMA = 5.0
+"""Signal in sigma from which a parameter of plausible size is worth fitting."""
+
+
 @dataclass(frozen=True)
 class SelectionSettings:
     """How the search runs.
@@ -49,6 +56,7 @@ class Selection:
     accepted : causes in the order in which they were found.
     p_values : family-wise, of the scan in which each was found.
     first, last : looks at the first fit and at the last one.
+    free, tied : fitted and eliminated parameters at the end.
     blunders : observations left out: (index in the recording given, its pose's row).
     """
 
@@ -57,6 +65,8 @@ class Selection:
     p_values: tuple[float, ...]
     first: Analysis
     last: Analysis
+    free: tuple[str, ...]
+    tied: frozenset[str]
     blunders: tuple[tuple[int, int], ...]
 
 
@@ -71,9 +81,14 @@ def select(
     number = np.arange(len(recording.observations.pose))
     most_blunders = int(settings.blunder_share * len(number))
     first: Analysis | None = None
+    settled = False
     while True:
         present = fit(model, recording, free, accepted)
         look = analyse(present, recording, tied, runs=settings.runs)
+        seen = newly_visible(look, tied) if accepted else ()
+        if seen:
+            free, tied = (*free, *seen), tied - set(seen)
+            continue
         first = first or look
         if _is_blunder(look, settings) and len(left_out) < most_blunders:
             row = look.suspect.label
@@ -83,16 +98,37 @@ def select(
             first = None if not accepted else first
             continue
         if look.p_value > settings.level or len(accepted) >= settings.most:
-            break
+            if settled or len(accepted) < 2:
+                break
+            settled = True
+            changed, accepted, p_values = _backward(model, recording, free, tied, present, p_values, settings)
+            if not changed:
+                break
+            continue
         family, constants = choose(look)
         tell(f"{look.families[family].cause} at {look.families[family].where}: p {look.p_value:.2g}")
         accepted = (*present.accepted, accepted_from(look, family, constants))
         p_values.append(look.p_value)
-    if len(accepted) > 1:
-        accepted, p_values = _backward(model, recording, free, tied, present, p_values, settings)
-        present = fit(model, recording, free, accepted)
-        look = analyse(present, recording, tied, runs=settings.runs)
-    return Selection(recording, present.accepted, tuple(p_values), first, look, tuple(left_out))
+    return Selection(recording, present.accepted, tuple(p_values), first, look, free, tied, tuple(left_out))
+
+
+def newly_visible(look: Analysis, tied: frozenset[str]) -> tuple[str, ...]:
+    """Parameters that were eliminated as dependent but show now that a cause is in the model.
+
+    A tilted base, for one, gives the vertical axis a load torque and makes its elasticity identifiable.
+    """
+    seen: list[str] = []
+    basis = look.basis
+    for name in sorted(tied):
+        column = look.at.parameters.get(name)
+        if column is None:
+            continue
+        column = column * (PLAUSIBLE_ELASTICITY if ".elastic_" in name else PLAUSIBLE_DEVIATION)
+        rest = column - basis @ (basis.T @ column)
+        if np.linalg.norm(rest) > VISIBLE_SIGMA:
+            seen.append(name)
+            basis = np.column_stack([basis, rest / np.linalg.norm(rest)])
+    return tuple(seen)
 
 
 def _is_blunder(look: Analysis, settings: SelectionSettings) -> bool:
@@ -120,10 +156,11 @@ def choose(look: Analysis) -> tuple[int, Constants]:
 def _backward(
     model: RobotModel, recording: Recording, free: tuple[str, ...], tied: frozenset[str], present: Fit,
     p_values: list[float], settings: SelectionSettings,
-) -> tuple[tuple[Accepted, ...], list[float]]:
+) -> tuple[bool, tuple[Accepted, ...], list[float]]:
     """With all others in the model: is each cause still needed, and is its name still the best?"""
     accepted = list(present.accepted)
     probabilities = list(p_values)
+    changed = False
     k = 0
     while k < len(accepted) and len(accepted) > 1:
         others = tuple(accepted[:k] + accepted[k + 1:])
@@ -131,14 +168,15 @@ def _backward(
         if look.p_value > settings.level:
             accepted = list(look.fit.accepted)
             del probabilities[k]
+            changed = True
             continue
         family, constants = choose(look)
-        found = look.families[family]
-        if found.key != accepted[k].family.key and _gain(look, family, accepted[k]) > 3.0:
+        if look.families[family].key != accepted[k].family.key and _gain(look, family, accepted[k]) > 3.0:
             accepted = list(look.fit.accepted)
             accepted.insert(k, accepted_from(look, family, constants))
+            changed = True
         k += 1
-    return tuple(accepted), probabilities
+    return changed, tuple(accepted), probabilities
 
 
 def _gain(look: Analysis, family: int, present: Accepted) -> float:
