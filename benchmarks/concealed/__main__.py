@@ -1,0 +1,138 @@
+"""Run a battery of concealed campaigns through the tool, score it, print the tables.
+
+    python -m benchmarks.concealed nulls --count 100 --out nulls.jsonl
+    python -m benchmarks.concealed singles --count 2 --causes backlash gear_ripple
+    python -m benchmarks.concealed table nulls.jsonl singles.jsonl
+
+Records are appended to --out one by one; what it holds already is not run again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import tempfile
+import time
+import traceback
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any
+
+for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):  # before numpy is loaded: a run uses one core
+    os.environ.setdefault(_name, "1")
+
+from benchmarks.concealed.adapter import ADAPTERS  # noqa: E402
+from benchmarks.concealed.scenarios import BATTERIES, Scenario  # noqa: E402
+from benchmarks.concealed.scoring import score  # noqa: E402
+from benchmarks.concealed.tables import report  # noqa: E402
+from fixtures.campaigns import write_campaign, write_poses  # noqa: E402
+from fixtures.recordings import record  # noqa: E402
+
+
+def run_one(scenario: Scenario, adapter: str) -> dict[str, Any]:
+    """Make, run and score one campaign; a failure of the tool is a record with ``error``."""
+    recording, truth = record(scenario.plan)
+    with tempfile.TemporaryDirectory(prefix="concealed-") as folder:
+        root = Path(folder)
+        campaign = write_campaign(recording, root / "campaign")
+        tables = {}
+        if truth.effects and truth.plan.level != "distances":
+            for name, kept in (("inside", truth.inside), ("outside", truth.outside)):
+                tables[name] = root / f"{name}.csv"
+                write_poses(kept.poses, truth, tables[name])
+        try:
+            answer = ADAPTERS[adapter](campaign, tables)
+            return score(scenario, recording, truth, answer)
+        except Exception as error:
+            return {
+                "key": scenario.key,
+                "battery": scenario.battery,
+                "label": scenario.label,
+                "level": truth.plan.level,
+                "snr": scenario.snr,
+                "seed": truth.plan.seed,
+                "robot": truth.plan.robot,
+                "error": f"{type(error).__name__}: {error}",
+                "traceback": traceback.format_exc()[-1500:],
+                "truth": [e.as_dict() for e in truth.effects],
+            }
+
+
+def _read(path: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
+
+
+def _wanted(arguments: argparse.Namespace, done: set[str]) -> Iterator[Scenario]:
+    for scenario in BATTERIES[arguments.battery](arguments.count, arguments.seed, arguments.level):
+        chosen = not arguments.causes or scenario.label in arguments.causes
+        snr = not arguments.snr or scenario.snr in arguments.snr
+        if chosen and snr and scenario.key not in done:
+            yield scenario
+
+
+def _run(arguments: argparse.Namespace) -> list[dict[str, Any]]:
+    records = _read(arguments.out) if arguments.out and arguments.out.exists() else []
+    done = {r["key"] for r in records if "error" not in r}
+    records = [r for r in records if "error" not in r]
+    stream = arguments.out.open("a", encoding="utf-8") if arguments.out else None
+    start = time.perf_counter()
+    try:
+        with ProcessPoolExecutor(arguments.jobs) as pool:
+            wanted = _wanted(arguments, done)
+            pending = []
+            for scenario in wanted:
+                pending.append(pool.submit(run_one, scenario, arguments.adapter))
+            for number, future in enumerate(pending, 1):
+                result = future.result()
+                records.append(result)
+                if stream:
+                    stream.write(json.dumps(result) + "\n")
+                    stream.flush()
+                if not arguments.quiet:
+                    print(
+                        f"{number}/{len(pending)} {time.perf_counter() - start:6.0f} s  {_line(result)}",
+                        file=sys.stderr,
+                    )
+    finally:
+        if stream:
+            stream.close()
+    return records
+
+
+def _line(result: dict[str, Any]) -> str:
+    if "error" in result:
+        return f"{result['key']}: {result['error'][:150]}"
+    told = ", ".join(f"{c['cause']}@{c['where']}{c['direction'] or ''}" for c in result["answer"]) or "nothing"
+    true = ", ".join(f"{e['cause']}@{e['where']}{e['direction'] or ''}" for e in result["truth"]) or "nothing"
+    mark = {True: "right", False: "WRONG", None: ""}[result.get("name_right", result.get("exact"))]
+    return f"{result['label']} SNR {result['snr']} ({result['robot']}): {true} -> {told} {mark} [{result['seconds']:.1f} s]"
+
+
+def main() -> int:
+    """Command line."""
+    parser = argparse.ArgumentParser(prog="benchmarks.concealed", description=(__doc__ or "").split("\n", 1)[0])
+    parser.add_argument("battery", choices=[*BATTERIES, "table"])
+    parser.add_argument("records", nargs="*", type=Path, help="with 'table': stored records")
+    parser.add_argument("--count", type=int, default=1, help="repetitions of the battery")
+    parser.add_argument("--seed", type=int, default=10_000)
+    parser.add_argument("--level", default="points", choices=["points", "frames", "distances", "sensor"])
+    parser.add_argument("--causes", nargs="*", default=[], help="only scenarios with these labels")
+    parser.add_argument("--snr", nargs="*", type=float, default=[], help="only these classes of SNR")
+    parser.add_argument("--adapter", choices=sorted(ADAPTERS), default="library")
+    parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--out", type=Path, help="file of records (JSON lines), appended to and resumed from")
+    parser.add_argument("-q", "--quiet", action="store_true")
+    arguments = parser.parse_args()
+    if arguments.battery == "table":
+        records = [r for path in arguments.records for r in _read(path)]
+    else:
+        records = _run(arguments)
+    print(report(records))
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
