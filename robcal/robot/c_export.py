@@ -18,7 +18,7 @@ from robcal.errors import InvalidInput
 from robcal.robot import c_templates as c
 from robcal.robot.c_expressions import array, function_body, number
 from robcal.robot.chain import Chain, chain_of
-from robcal.robot.compensation import LARGEST_STEP, cell_frames
+from robcal.robot.compensation import FLIP, LARGEST_STEP, cell_frames
 from robcal.robot.inverse import carried_arm
 from robcal.robot.inverse_analytic import perpendicular
 from robcal.robot.inverse_numeric import NumericSettings, start_configurations
@@ -154,7 +154,8 @@ def _tables(chain: Chain, world_T_base: Array) -> str:
 def _inverse_parts(chain: Chain) -> list[str]:
     settings = NumericSettings()
     length = settings.weight(chain)[3]
-    parts = [c.VECTORS, c.CHAIN, f"\n#define ROTATION_LENGTH {number(length)}", f"#define LARGEST_STEP {LARGEST_STEP}"]
+    parts = [c.VECTORS, c.CHAIN, f"\n#define ROTATION_LENGTH {number(length)}"]
+    parts.append(f"#define LARGEST_STEP {number(LARGEST_STEP)}\n#define FLIP {number(FLIP)}")
     if chain.n_joints < 6:
         parts.append(f"#define TILT_TOLERANCE {number(settings.tilt_tolerance)}")
     parts.append(c.NUMERIC)
@@ -178,8 +179,10 @@ def _inverse_parts(chain: Chain) -> list[str]:
     if isinstance(structure, SphericalWrist):
         if structure.shoulder is not None:
             parts.append(f"static const double SHOULDER[3] = {array(structure.shoulder)};")
+        if structure.arm != "meeting_12":
+            parts.append(c.TO_PLANE)
         arms = {"parallel_23": c.ARM_PARALLEL_23, "meeting_12": c.ARM_MEETING_12, "parallel_12": c.ARM_PARALLEL_12}
         parts += [c.TWO_TURNS, arms[structure.arm], c.SPHERICAL_WRIST]
     else:
-        parts.append(c.PARALLEL_ARM)
+        parts += [c.TO_PLANE, c.PARALLEL_ARM]
     return [*parts, c.CLOSED_INVERSE]

@@ -398,7 +398,9 @@ static int to_distance(const double *w, const double *u, const double *v, double
     t[1] = middle - half;
     return possible;
 }
+"""
 
+TO_PLANE = r"""
 /* n . rot(w, t) u = h */
 static int to_plane(const double *w, const double *u, const double *n, double h, double *t)
 {
@@ -805,13 +807,19 @@ static int correct(const double *F, const double *real, double *q)
 {
 #if N >= 6
     double Fh[12], T[12], inverse[12], gap[12], target[12], next[N];
-    int result;
+    int result, i;
     multiply(BASE_T_WORLD, real, Fh);
     chain(q, T, 0);
     invert(Fh, inverse);
     multiply(inverse, F, gap);
     multiply(T, gap, target);
     result = @P@_nominal_inverse(target, q, next);
+    for (i = 0; i < N && result == @P@_OK; ++i) {
+        /* a correction must not change the configuration */
+        if (fabs(next[i] - q[i]) > FLIP) {
+            result = @P@_OUT_OF_REACH;
+        }
+    }
     if (result == @P@_OK) {
         memcpy(q, next, sizeof next);
     }

@@ -34,6 +34,9 @@ LEFT_OVER = 1e-6
 LARGEST_STEP = 0.1
 """rad or m; a single joint step is no longer than this (near a singularity it would be without bound)."""
 
+FLIP = 0.8
+"""rad or m; a correction that moves a joint further has left the configuration (elbow or wrist flipped)."""
+
 Method = Literal["exact", "first_order", "none"]
 
 
@@ -216,6 +219,12 @@ def _correct(
         chosen = select(inverse_kinematics(chain, state.F_star[rows], q, all_branches=False))
         new, moved = chosen.q, chosen.reachable
         reasons = [None if r is None else f"the frame is, but its corrected target is not: {r}" for r in chosen.reason]
+        with np.errstate(invalid="ignore"):
+            flipped = moved & (np.max(np.abs(new - q), axis=1) > FLIP)
+        moved = moved & ~flipped
+        new = np.where(moved[:, None], new, np.nan)
+        for i in np.flatnonzero(flipped):
+            reasons[i] = "the corrected target is not reachable in this configuration (singular or fully stretched)"
     state.q[rows] = new
     for i in np.flatnonzero(~moved):
         state.reason[rows[i]] = reasons[i]
