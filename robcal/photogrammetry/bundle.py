@@ -341,7 +341,8 @@ def _check_size(work: _Work, free: Sequence[str]) -> None:
     unknowns = 6 * len(images) + 3 * len(targets) + len(free) - 7
     if 2 * len(work.kept) < unknowns:
         raise NotIdentifiable(
-            f"{2 * len(work.kept)} image coordinates cannot determine {unknowns} unknowns: take more images", tuple(free)
+            f"{2 * len(work.kept)} image coordinates cannot determine {unknowns} unknowns: take more images",
+            tuple(free),
         )
 
 
@@ -367,9 +368,7 @@ def _raise_singular(problem: Problem, state: State, free: Sequence[str], ids: In
     )
 
 
-def _undetermined(
-    work: _Work, basis: Array, free: Sequence[str], ids: IntArray, datum: DatumWish
-) -> tuple[str, ...]:
+def _undetermined(work: _Work, basis: Array, free: Sequence[str], ids: IntArray, datum: DatumWish) -> tuple[str, ...]:
     """Free intrinsics that the marks do not determine, worst first."""
     if not free:
         return ()
@@ -400,14 +399,22 @@ def _leave_out(
     if settings.undetermined == "raise":
         raise NotIdentifiable(f"the images do not determine {', '.join(bad)}: {remedy}", bad)
     first = bad[0]
-    group = {"p1": ("p1", "p2"), "p2": ("p1", "p2"), "cx": ("cx", "cy"), "cy": ("cx", "cy")}.get(first, (first,))
+    pairs: dict[str, tuple[str, ...]] = {name: pair for pair in (("p1", "p2"), ("cx", "cy")) for name in pair}
+    group = pairs.get(first, (first,))
+    values = work.state.camera.vector
+    if {"fx", "fy"} <= set(free) and first in ("fx", "fy"):
+        # perhaps only their ratio is open (a plane seen without roll): then one number for both
+        values[1] = values[0] * start.fy / start.fx
+        work.state = replace(work.state, camera=work.state.camera.with_vector(values))
+        free[:] = ["f", *(name for name in free if name not in ("fx", "fy"))]
+        left_out.append(("fy", "its ratio to fx is not determined by these images, held at its start value"))
+        return
     if first in ("fx", "fy", "f"):
         if not settings.hold_focal:
             raise NotIdentifiable(
                 f"the images do not determine the focal length ({', '.join(bad)}) against the distance: {remedy}", bad
             )
         group = ("fx", "fy", "f")
-    values = work.state.camera.vector
     for name in group:
         if name in free:
             free.remove(name)

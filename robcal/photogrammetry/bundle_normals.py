@@ -9,8 +9,10 @@ Stations are perturbed on the right: p_camera = R (Exp(omega) p + rho) + t.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import linalg
 
 from robcal.photogrammetry.camera import Camera, project_with_jacobians
@@ -27,7 +29,7 @@ class State:
     points: Array
 
     def moved(self, basis: Array, reduced: Array, stations: Array) -> State:
-        """The state after a step: reduced (a,) = free intrinsics (columns of basis) then coordinates, stations (n, 6)."""
+        """The state after a step: reduced (a,) = free intrinsics (columns of basis) then points; stations (n, 6)."""
         k = basis.shape[1]
         return State(
             self.camera.with_vector(self.camera.vector + basis @ reduced[:k]),
@@ -54,7 +56,7 @@ class MarkOrder:
 
 def _slices(sorted_index: IntArray, count: int) -> list[slice]:
     edges = np.searchsorted(sorted_index, np.arange(count + 1))
-    return [slice(int(a), int(b)) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+    return [slice(a, b) for a, b in pairwise(edges.tolist())]
 
 
 def whitened_residuals(state: State, order: MarkOrder, shift: Array) -> Array:
@@ -107,7 +109,7 @@ def linearise(state: State, order: MarkOrder, basis: Array, shift: Array) -> Lin
 
 @dataclass(frozen=True)
 class LinearisedLengths:
-    """Scale bars: whitened residuals (b,), unit directions (b, 3) from second to first point over sigma, rows (b, 2)."""
+    """Scale bars: whitened residuals (b,), directions (b, 3) to the first point over sigma, rows (b, 2) of points."""
 
     r: Array
     direction: Array
@@ -205,7 +207,7 @@ class Factor:
     numpy.linalg.LinAlgError : the system is singular.
     """
 
-    def __init__(self, normals: Normals, constraints: Array, held: Array, damping: float = 0.0) -> None:
+    def __init__(self, normals: Normals, constraints: Array, held: NDArray[np.bool_], damping: float = 0.0) -> None:
         A, G, V = normals.A, normals.G, normals.V
         n, a = len(V), len(A)
         self.k = a - len(constraints)

@@ -114,4 +114,4 @@ class NetworkOperator:
         b = P.T @ self.residuals
         estimate = inverse @ b
         chi2 = float(b @ estimate)
-        return EffectTest(estimate, inverse, chi2, float(stats.chi2.sf(chi2, P.shape[1])))
+        return EffectTest(estimate, np.asarray(inverse, dtype=float), chi2, float(stats.chi2.sf(chi2, P.shape[1])))

@@ -71,23 +71,23 @@ def finish(
         if iterate:
             state, summary = minimise(problem, state)
         grown = np.ones(groups)
-    factor_all = float(grown[0] ** 2) if groups == 1 else 1.0
+    scaled = float(grown[0] ** 2) if groups == 1 else 1.0
     # one component and no bars: the estimate only scales all cofactors
-    Q = Q * factor_all if len(stated_sigma) == 0 else Q
+    Q = Q * scaled if len(stated_sigma) == 0 else Q
     group_sigma0 = problem.group_sigma * grown
     whitened = whitened / grown[problem.group][:, None]
-    Q_station, Q_mixed = factor.station_cofactors(Q / factor_all if len(stated_sigma) == 0 else Q)
+    Q_station, Q_mixed = factor.station_cofactors(Q / scaled if len(stated_sigma) == 0 else Q)
     if len(stated_sigma) == 0:
-        Q_station, Q_mixed = Q_station * factor_all, Q_mixed * factor_all
+        Q_station, Q_mixed = Q_station * scaled, Q_mixed * scaled
     L = problem.order.factor
     C = rel.residual_cofactor
     residuals = np.einsum("mij,mj->mi", L, lin.r)
     in_pixels = L @ C @ np.swapaxes(L, 1, 2)
     redundancy = np.diagonal(L @ C @ np.linalg.inv(L), axis1=1, axis2=2)
-    sigma = np.sqrt(np.maximum(np.diagonal(in_pixels, axis1=1, axis2=2), 0.0))
-    sigma = sigma * group_sigma0[problem.group][:, None]
-    w = np.where(redundancy > 1e-4, residuals / np.maximum(sigma, 1e-300), 0.0)
-    total = int(round(float(np.sum(rel.share))))
+    spread = np.sqrt(np.maximum(np.diagonal(in_pixels, axis1=1, axis2=2), 0.0))
+    spread = spread * group_sigma0[problem.group][:, None]
+    w = np.where(redundancy > 1e-4, residuals / np.maximum(spread, 1e-300), 0.0)
+    total = round(float(np.sum(rel.share)))
     if len(stated_sigma):
         total = 2 * len(problem.order.marks) + len(stated_sigma) - k - 6 * problem.order.images
         total -= int(np.count_nonzero(~problem.held(len(state.points))[k:])) - problem.datum.defect

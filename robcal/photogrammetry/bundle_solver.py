@@ -146,8 +146,9 @@ def minimise(
     history: list[float] = []
     converged, words = False, "iteration limit reached"
     held = problem.held(len(state.points))
-    iteration = 0
-    for iteration in range(1, max_iterations + 1):
+    steps = 0
+    for step in range(1, max_iterations + 1):
+        steps = step
         lin = linearise(state, order, problem.basis, shift)
         weights = problem.weights
         limit = None
@@ -198,7 +199,7 @@ def minimise(
             break
     summary = SolveSummary(
         converged,
-        iteration,
+        steps,
         words,
         history[0],
         history[-1],

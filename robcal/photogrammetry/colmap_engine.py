@@ -66,7 +66,9 @@ def to_reconstruction(
         track = pycolmap.Track()
         for row in np.flatnonzero(marks.target == i).tolist():
             track.add_element(*slot[row])
-        model.add_point3D_with_id(i + 1, pycolmap.Point3D(xyz=point, track=track, color=np.array([255, 255, 255], np.uint8)))
+        model.add_point3D_with_id(
+            i + 1, pycolmap.Point3D(xyz=point, track=track, color=np.array([255, 255, 255], np.uint8))
+        )
     return model
 
 

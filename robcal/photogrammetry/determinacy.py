@@ -95,7 +95,8 @@ def strong_correlations(
     rows = np.argwhere(np.abs(mixed) > limit)
     rows = rows[np.argsort(-np.abs(mixed[tuple(rows.T)]))][: max(most - len(found), 0)]
     found += [
-        Correlation(names[i], f"{image_names[j]}.{STATION_NAMES[q]}", float(mixed[i, j, q])) for i, j, q in rows.tolist()
+        Correlation(names[i], f"{image_names[j]}.{STATION_NAMES[q]}", float(mixed[i, j, q]))
+        for i, j, q in rows.tolist()
     ]
     return tuple(found)
 

@@ -122,7 +122,14 @@ def length_results(
         checked = kind == "check" or sigma > 1e-3 * s
         w = error / sigma if checked and sigma > 0 else 0.0
         out.append(
-            LengthResult((a, b), float(d), float(expected), error, sigma if checked else 0.0, w,
-                         "scale_bar" if kind == "scale_bar" else "check")  # fmt: skip
+            LengthResult(
+                (a, b),
+                float(d),
+                float(expected),
+                error,
+                sigma if checked else 0.0,
+                w,
+                "scale_bar" if kind == "scale_bar" else "check",
+            )
         )
     return tuple(out)

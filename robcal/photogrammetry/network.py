@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,9 +21,9 @@ from robcal.transforms import Array
 IntArray = NDArray[np.int64]
 
 
-def frozen(values: ArrayLike, dtype: type = float) -> NDArray:
+def frozen(values: ArrayLike, dtype: type = float) -> NDArray[Any]:
     """A read-only copy, so that results cannot be changed behind their summary."""
-    out = np.array(values, dtype=dtype)
+    out: NDArray[Any] = np.array(values, dtype=dtype)
     out.setflags(write=False)
     return out
 

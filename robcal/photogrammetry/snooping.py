@@ -87,7 +87,7 @@ def worst_marks(statistic: Array, critical: float, image: IntArray, target: IntA
 
 
 def variance_factors(r: Array, share: Array, group: IntArray, groups: int) -> Array:
-    """Variance factor of each group (groups,): sum of squared whitened residuals by sum of redundancies; NaN if none."""
+    """Variance factors (groups,): sum of squared whitened residuals by sum of redundancies; NaN for an empty group."""
     squares = np.bincount(group, weights=np.sum(r**2, axis=1), minlength=groups)
     redundancy = np.bincount(group, weights=share, minlength=groups)
     return np.where(redundancy > 1e-9, squares / np.maximum(redundancy, 1e-9), np.nan)

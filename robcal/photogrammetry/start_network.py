@@ -7,7 +7,7 @@ that explains the most marks wins.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import cv2
@@ -22,7 +22,7 @@ from robcal.photogrammetry.datum import Datum
 from robcal.photogrammetry.determinacy import intrinsics_basis
 from robcal.photogrammetry.network import ImageMarks
 from robcal.photogrammetry.start_planar import best_references, planar_starts
-from robcal.photogrammetry.start_resection import ideal_points, resect, residuals, robust_cost
+from robcal.photogrammetry.start_resection import ideal_points, resect, robust_cost
 from robcal.transforms import Array, frame
 
 _TRUNCATED = 9.0
@@ -147,43 +147,21 @@ class _Builder:
         points = np.full((self.targets, 3), np.nan)
         return StartNetwork(camera, poses, points, np.zeros(len(self.marks), dtype=bool), np.inf)
 
-    def seeds(self, known_points: Array | None, core: NDArray[np.int64]) -> list[StartNetwork] | _Lazy:
-        """Seeds in the order of promise."""
-        return _Lazy([self._known(known_points), self._planes(), self._pairs(core)])
-
-    def _known(self, known_points: Array | None) -> Callable[[], Sequence[StartNetwork]]:
-        def make() -> list[StartNetwork]:
-            if known_points is None or np.count_nonzero(np.isfinite(known_points[:, 0])) < 4:
-                return []
-            return [
-                replace(self.empty(self.with_focal(f)), points=np.array(known_points)) for f in self.focal_candidates()
-            ]
-
-        return make
-
-    def _planes(self) -> Callable[[], Sequence[StartNetwork]]:
-        def make() -> list[StartNetwork]:
-            out = []
-            for reference in best_references(self.marks, self.images, self.targets):
-                for start in planar_starts(self.marks, int(reference), self.targets, self.camera, self.focal_known):
-                    out.append(replace(self.empty(self.with_focal(start.focal)), points=start.points))
-            return out
-
-        return make
-
-    def _pairs(self, core: NDArray[np.int64]) -> Callable[[], Sequence[StartNetwork]]:
-        def make() -> list[StartNetwork]:
-            pairs = [(int(i), int(j)) for a, i in enumerate(core) for j in core[:a] if self.common[i, j] >= 6]
-            pairs.sort(key=lambda p: -self.common[p])
-            out = []
-            for i, j in pairs[:6]:
-                for focal in self.focal_candidates():
-                    found = self._relative(i, j, self.with_focal(focal))
-                    if found is not None:
-                        out.append(found)
-            return out
-
-        return make
+    def seeds(self, known_points: Array | None, core: NDArray[np.int64]) -> Iterator[StartNetwork]:
+        """Seeds in the order of promise, made only when the earlier ones have failed."""
+        if known_points is not None and np.count_nonzero(np.isfinite(known_points[:, 0])) >= 4:
+            for f in self.focal_candidates():
+                yield replace(self.empty(self.with_focal(f)), points=np.array(known_points))
+        for reference in best_references(self.marks, self.images, self.targets):
+            for start in planar_starts(self.marks, int(reference), self.targets, self.camera, self.focal_known):
+                yield replace(self.empty(self.with_focal(start.focal)), points=start.points)
+        pairs = [(int(i), int(j)) for a, i in enumerate(core) for j in core[:a] if self.common[i, j] >= 6]
+        pairs.sort(key=lambda p: -self.common[p])
+        for i, j in pairs[:6]:
+            for focal in self.focal_candidates():
+                found = self._relative(i, j, self.with_focal(focal))
+                if found is not None:
+                    yield found
 
     def _relative(self, i: int, j: int, camera: Camera) -> StartNetwork | None:
         """Two-view seed by the essential matrix."""
@@ -237,8 +215,9 @@ class _Builder:
             if point is None:
                 continue
             for _ in range(2):  # once more without the rays that do not meet the others
-                miss = np.array([residuals(network.camera, network.camera_T_body[q], point[None], self.marks.xy[row][None])[0]
-                                 for q, row in zip(j, rows, strict=True)])  # fmt: skip
+                p = R[j] @ point + t[j]
+                miss = np.linalg.norm(project(network.camera, p) - self.marks.xy[rows], axis=1)
+                miss = np.where(np.isfinite(miss), miss, np.inf)
                 good = miss < limit
                 if good.all() or np.count_nonzero(good) < 2:
                     break
@@ -260,9 +239,7 @@ class _Builder:
         while True:
             located, placed = network.located, network.placed
             count = {
-                int(j): int(np.count_nonzero(located[self.marks.target[self.rows[j]]]))
-                for j in images
-                if not placed[j]
+                int(j): int(np.count_nonzero(located[self.marks.target[self.rows[j]]])) for j in images if not placed[j]
             }
             options = [j for j, c in count.items() if c >= 4 and failed.get(j, 0) < c]
             if not options:
@@ -308,7 +285,7 @@ class _Builder:
         mine = np.isin(self.marks.image, core)
         length = self._lengths(network)[mine]
         return bool(np.mean(length < 0.001 * self.size) > 0.85) and (
-            self.focal_known or bool(np.median(length) < 2e-4 * self.size)
+            self.focal_known or bool(np.median(length) < 5e-4 * self.size)
         )
 
     def _lengths(self, network: StartNetwork) -> Array:
@@ -373,20 +350,9 @@ class _Builder:
         stages = [first]
         if images >= 4:
             stages.append(("f", "k1"))
-        if images >= 8 and final:
+        if images >= 8:
             stages.append(("f", "cx", "cy", "k1", "k2", "p1", "p2"))
         return stages
-
-
-class _Lazy:
-    """Seeds made only when the earlier ones have failed."""
-
-    def __init__(self, makers: Sequence[Callable[[], Sequence[StartNetwork]]]) -> None:
-        self.makers = makers
-
-    def __iter__(self):  # noqa: ANN204
-        for make in self.makers:
-            yield from make()
 
 
 def _plausible(camera: Camera, size: float) -> bool:

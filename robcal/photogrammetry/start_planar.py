@@ -42,7 +42,8 @@ def homographies(marks: ImageMarks, reference: int, targets: int, tolerance: flo
         H, mask = cv2.findHomography(lookup[marks.target[rows]], marks.xy[rows], cv2.RANSAC, tolerance)
         if H is not None and mask is not None and mask.sum() >= max(5, 0.6 * len(rows)):
             out.append((int(image), H))
-    return out
+    # a few dozen views tell all there is to tell; spread over the list
+    return out if len(out) <= 30 else [out[i] for i in np.linspace(0, len(out) - 1, 30).astype(int)]
 
 
 def _misfit(H: Array, focal: Array, normal: Array, centre: Array) -> Array:

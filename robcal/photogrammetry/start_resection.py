@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from robcal.photogrammetry.camera import Camera, normalise, project, project_with_jacobians
 from robcal.transforms import Array, frame, retract, skew
@@ -115,7 +115,7 @@ def _judge(camera: Camera, T: Array, points: Array, xy: Array, scale: float) -> 
     return Resection(T, length < 3.0 * scale, robust_cost(length, scale))
 
 
-def _from_opencv(rvec: Array, tvec: Array) -> Array:
+def _from_opencv(rvec: ArrayLike, tvec: ArrayLike) -> Array:
     return frame(cv2.Rodrigues(np.asarray(rvec, dtype=float))[0], np.asarray(tvec, dtype=float).ravel())
 
 
