@@ -48,17 +48,16 @@ def detect_targets(image: NDArray, settings: DetectionSettings = _DEFAULT) -> De
     if message:
         return _detections(image, empty_columns(), noise, log, message)
     bright, bright_noise = _bright(image, noise, settings)
-    saturation = saturation_level(bright) if settings.saturation_level is None else settings.saturation_level
-    if settings.polarity == "dark" and settings.saturation_level is not None:
-        saturation = np.iinfo(image.dtype).max - settings.saturation_level
+    saturation = _saturation(bright, settings)
     candidates = find_candidates(bright, bright_noise, settings, log)
     late = _may_be_ring_parts(candidates) if settings.ring12 else np.zeros(len(candidates), bool)
-    dots, bright_noise, _ = fit_dots(bright, candidates.take(~late), bright_noise, saturation)
+    dots, bright_noise, _ = fit_dots(bright, candidates.take(~late), bright_noise, saturation, settings.max_misfit)
+    log.count(Reason.SHAPE, int((~late).sum()) - len(dots))
     dots = _accept(dots, bright, bright_noise, settings, log)
     readings, dots = _read(bright, dots, bright_noise, saturation, settings)
     waiting = _without_ring_parts(candidates.take(late), dots, readings, log)
     if len(waiting):
-        more, _, _ = fit_dots(bright, waiting, bright_noise, saturation)
+        more, _, _ = fit_dots(bright, waiting, bright_noise, saturation, settings.max_misfit)
         more = _accept(more, bright, bright_noise, settings, log)
         dots, readings = _merged(bright, dots, readings, more, bright_noise, saturation, settings)
     dots, readings = _without_duplicates(dots, readings, log)
@@ -106,16 +105,24 @@ def _bright(image: NDArray, noise: NoiseModel, settings: DetectionSettings) -> t
     return top - image, replace(noise, gain=-noise.gain, level=float(top) - noise.level)
 
 
+def _saturation(bright: NDArray, settings: DetectionSettings) -> float:
+    top = float(np.iinfo(bright.dtype).max)
+    if settings.polarity == "dark":
+        # dark dots are cut off at black only
+        return top
+    return saturation_level(bright) if settings.saturation_level is None else settings.saturation_level
+
+
 def saturation_level(image: NDArray) -> float:
     """Grey value at which the image is cut off, infinity if none: the top of the range, or a plateau below it."""
     top, high = int(np.iinfo(image.dtype).max), int(image.max())
     if high == top:
         return float(top)
     plateau = int(np.count_nonzero(image == high))
-    step = max(1, (top + 1) >> 8)
-    below = int(np.count_nonzero(image >= max(high - step, 0))) - plateau
+    reach = max(1, (top + 1) >> 8)
+    below = int(np.count_nonzero(image >= max(high - 4 * reach, 0))) - plateau
     # free grey values thin out towards their maximum; a pile at the very maximum is a cut
-    return float(high) if plateau >= 12 and plateau > 4 * below else float("inf")
+    return float(high) if plateau >= 30 and plateau > 2 * below else float("inf")
 
 
 def _may_be_ring_parts(candidates: Candidates) -> NDArray[np.bool_]:

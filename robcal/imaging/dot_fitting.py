@@ -82,16 +82,19 @@ class FittedDots:
 
 
 def fit_dots(
-    image: NDArray, candidates: Candidates, noise: NoiseModel, saturation: float
+    image: NDArray, candidates: Candidates, noise: NoiseModel, saturation: float, max_misfit: float = 0.1
 ) -> tuple[FittedDots, NoiseModel, float]:
     """Fits all candidates; also returns the noise model improved by them and the prior sigma of gain gradients.
+
+    The dots are fewer than the candidates: hopeless fits are left out, in the order of the candidates.
 
     Parameters
     ----------
     image : (h, w), bright dots. candidates : starts. noise : estimated from the image. saturation : grey value.
+    max_misfit : fits with three times this misfit (by contrast) after the first round are given up.
     """
-    groups = gather_windows(image, candidates, saturation)
-    fits = [iterate(_start(candidates, window), window, noise, 12, tolerance=0.2) for window in groups]
+    groups, fits = _first_round(image, candidates, noise, saturation, max_misfit)
+    noise = _noise_around(groups, fits, noise)
     noise = _noise_inside(groups, fits, noise)
     fits = [iterate(fit, window, noise, 2, tolerance=0.05) for window, fit in zip(groups, fits, strict=True)]
     shading, prior = _shading(groups, fits)
@@ -99,7 +102,7 @@ def fit_dots(
     results = []
     for window, fit in zip(groups, fits, strict=True):
         results.append(_finish(fit, window, noise, shading[window.index], candidates))
-    return _join(results, groups, len(candidates)), noise, prior
+    return _join(results, groups), noise, prior
 
 
 def refit_coded(
@@ -121,7 +124,7 @@ def refit_coded(
         clean = replace(clean, valid=clean.valid & ~(far & (clean.value > background + 0.2 * contrast)))
         fit = iterate(_start(candidates, clean), clean, noise, 6, tolerance=0.1)
         results.append(_finish(fit, clean, noise, dots.shading_sigma[source], candidates))
-    return _join(results, groups, len(rows))
+    return _join(results, groups)
 
 
 def _start(candidates: Candidates, window: Windows) -> EllipseFits:
@@ -131,6 +134,44 @@ def _start(candidates: Candidates, window: Windows) -> EllipseFits:
         candidates.xy[rows], matrix_from_axes(candidates.semi_axes[rows], candidates.angle[rows]), np.log(s)
     ])  # fmt: skip
     return start(shape, candidates.base[rows], candidates.peak[rows], window, np.zeros(len(rows), bool))
+
+
+def _first_round(
+    image: NDArray, candidates: Candidates, noise: NoiseModel, saturation: float, max_misfit: float
+) -> tuple[list[Windows], list[EllipseFits]]:
+    """Fits of all candidates one by one; what is nowhere near an ellipse after a few steps is not pursued."""
+    groups = gather_windows(image, candidates, saturation)
+    kept_groups, kept_fits = [], []
+    for window in groups:
+        fit = iterate(_start(candidates, window), window, noise, 7, tolerance=0.2)
+        used = np.maximum((fit.weight > 0).sum(axis=1), 1)
+        mean_square = np.where(fit.weight > 0, fit.residual**2, 0.0).sum(axis=1) / used
+        expected = np.where(fit.weight > 0, 1.0 / np.maximum(fit.weight, 1e-30), 0.0).sum(axis=1) / used
+        contrast = np.abs(fit.parameters[:, 9])
+        near = np.flatnonzero(mean_square - 2.0 * expected < (3.0 * max_misfit * contrast) ** 2)
+        if near.size:
+            window, fit = window.take(near), fit.take(near)
+            kept_groups.append(window)
+            kept_fits.append(iterate(fit, window, noise, 6, tolerance=0.2))
+    return kept_groups, kept_fits
+
+
+def _noise_around(groups: list[Windows], fits: list[EllipseFits], noise: NoiseModel) -> NoiseModel:
+    """The noise model with the read noise seen around the dots, where it is more than the quietest parts show."""
+    found = []
+    for window, fit in zip(groups, fits, strict=True):
+        distance = edge_distance(fit.parameters, window.x, window.y)[0]
+        background = (fit.weight > 0) & (distance > 2.4 * np.exp(fit.parameters[:, 5, None]))
+        count = background.sum(axis=1)
+        use = fit.converged & (count >= 20)
+        squares = np.where(background, fit.residual**2, 0.0).sum(axis=1)
+        # three parameters of the background plane, two more for what the edge takes
+        found.append((squares[use] / (count[use] - 5.0)) - noise.gain * (fit.parameters[use, 6] - noise.level))
+    variances = np.concatenate(found) if found else np.zeros(0)
+    if len(variances) < 8:
+        return noise
+    typical = float(np.median(variances))
+    return replace(noise, variance=typical) if typical > 1.3 * noise.variance else noise
 
 
 def _noise_inside(groups: list[Windows], fits: list[EllipseFits], noise: NoiseModel) -> NoiseModel:
@@ -177,7 +218,7 @@ def _correlation(groups: list[Windows], fits: list[EllipseFits]) -> float:
 
 def _shading(groups: list[Windows], fits: list[EllipseFits]) -> tuple[Array, float]:
     """Prior sigma of each dot's relative gain gradient per radius, (n,), and the common one of the image, per px."""
-    n = sum(len(window.index) for window in groups)
+    n = max((int(window.index.max()) + 1 for window in groups), default=0)
     square, variance, good, radius = np.zeros(n), np.ones(n), np.zeros(n, bool), np.ones(n)
     for window, fit in zip(groups, fits, strict=True):
         gradient, expected = free_shading(fit)
@@ -260,8 +301,8 @@ def _columns(fit: EllipseFits, window: Windows, noise: NoiseModel) -> dict:
     }  # fmt: skip
 
 
-def _join(results: list[dict], groups: list[Windows], n: int) -> FittedDots:
-    """Columns of all groups in the order of the candidates; axes of spots by the blur of the others."""
+def _join(results: list[dict], groups: list[Windows]) -> FittedDots:
+    """Columns of all groups in the order of the candidates that were fitted; axes of spots by the blur of the others."""
     if not results:
         return FittedDots(
             np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros((0, 3)), np.zeros((0, 2)), *(np.zeros(0) for _ in range(4)),

@@ -54,7 +54,7 @@ class EllipseFits:
 
     def covariance(self) -> Array:
         """(n, 12, 12) inverse of the normal matrices; infinite centre variances where they are singular."""
-        scale = 1.0 / np.sqrt(np.maximum(np.diagonal(self.normal, axis1=1, axis2=2), 1e-300))
+        scale = 1.0 / np.sqrt(np.maximum(np.diagonal(self.normal, axis1=1, axis2=2), 1e-100))
         scaled = self.normal * scale[:, :, None] * scale[:, None, :]
         values, vectors = np.linalg.eigh(scaled)
         singular = values[:, 0] < 1e-12
@@ -196,6 +196,8 @@ def iterate(
         damping[active[~better]] = np.maximum(damping[active[~better]] * 20.0, 1e-3)
         # N step squared is the move in units of sigma
         move = np.einsum("ni,nij,nj->n", step, normal[active], step)
+        # of misfit as large as k sigma the minimum need not be known better than k sigma
+        move /= np.maximum(1.0, cost[active] / np.maximum((weight[active] > 0).sum(axis=1), 1))
         done = (better & (move < tolerance**2)) | (~better & (damping[active] > 1e4)) | (~better & (move < tolerance**2))
         converged[active[done]] = True
         active = active[~done]
@@ -235,7 +237,7 @@ def free_shading(fits: EllipseFits) -> tuple[Array, Array]:
 
 
 def _marginal_shading(fits: EllipseFits, normal: Array, right: Array, contrast: Array) -> tuple[Array, Array]:
-    scale = 1.0 / np.sqrt(np.maximum(np.diagonal(normal, axis1=1, axis2=2), 1e-300))
+    scale = 1.0 / np.sqrt(np.maximum(np.diagonal(normal, axis1=1, axis2=2), 1e-100))
     scaled = normal * scale[:, :, None] * scale[:, None, :]
     scaled[:, np.arange(PARAMETERS), np.arange(PARAMETERS)] += 1e-10
     # gradient of the data's cost at the present parameters equals minus the prior's pull (stationary point)

@@ -32,6 +32,9 @@ _MARGIN = 0.25  # a segment's brightness must keep this distance from the half
 _RMS_MAX = 0.14  # of the ring's brightness, readings minus prediction over the ring
 _PATCH_MAX = 0.42  # the same, mean over any patch of 1/4 segment by half the ring's width
 _GAP_MAX = 0.22
+_MINOR_AXIS_MIN = 1.3  # px; below it neither gap nor segments are resolved
+_MINOR_BY_BLUR_MIN = 1.5
+_BRIGHT_MIN, _BRIGHT_MAX = 2, 10  # bright segments of a code that is not known beforehand
 
 
 def canonical_id(bits: int) -> int:
@@ -145,7 +148,9 @@ def read_rings(
     profile = (factor * ring).sum(axis=1) / (factor**2).sum(axis=1)
     sigma_angle = angular / 2.5
     evidence = np.sort(profile, axis=1)[:, -3] > _EVIDENCE
-    readable = np.flatnonzero(evidence & complete & (contrast > 0))
+    minor = 1.0 / np.linalg.eigvalsh(_matrices(b))[:, 1]
+    resolved = (minor > _MINOR_AXIS_MIN) & (minor > _MINOR_BY_BLUR_MIN * blur)
+    readable = np.flatnonzero(evidence & complete & resolved & (contrast > 0))
     if readable.size == 0:
         return RingReadings(empty.code, evidence, empty.phase, empty.bits, empty.level)
     fit = _fit(profile[readable], sigma_angle[readable])
@@ -157,10 +162,17 @@ def read_rings(
     for row, good in zip(readable, sure, strict=True):
         reading = int("".join("1" if bit else "0" for bit in bits[row]), 2)
         number = canonical_id(reading)
-        allowed = number in known_codes if known_codes is not None else 0 < number < (1 << SEGMENTS) - 1
+        allowed = _allowed(number, known_codes)
         if good and allowed:
             code[row] = number
     return RingReadings(code, evidence, phase, bits, level)
+
+
+def _allowed(number: int, known_codes: frozenset[int] | None) -> bool:
+    if known_codes is not None:
+        return number in known_codes
+    # one bright or one dark segment can be anything: dust beside a dot, a scratch across a plain ring
+    return _BRIGHT_MIN <= number.bit_count() <= _BRIGHT_MAX
 
 
 @dataclass(frozen=True)

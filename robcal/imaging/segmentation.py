@@ -8,6 +8,7 @@ threshold of its own.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -21,6 +22,7 @@ from robcal.imaging.settings import DetectionSettings
 Array = NDArray[np.float64]
 
 _MAX_NODES = 6000  # thresholds tried in one image; a photograph of something else must not take minutes
+_MAX_PARTS = 4000  # connected parts above the background, holes included; beyond, the threshold is raised
 _MAX_DEPTH = 7
 _CROSS = np.ones((5, 5), np.uint8)
 
@@ -92,11 +94,19 @@ def find_candidates(
     noise : its noise model. settings : limits. log : takes what is refused, with the reason.
     """
     background = coarse_background(image, settings.max_axis_px)
-    top = np.iinfo(image.dtype).max
+    top = int(np.iinfo(image.dtype).max)
     lift = max(5.0 * float(np.sqrt(noise.at(float(np.median(background))))), 1.5 * noise.step)
-    threshold = cv2.add(background, float(min(int(np.ceil(lift)), top)))
+    while True:
+        threshold = cv2.add(background, float(min(int(np.ceil(lift)), top)))
+        contours, hierarchy = cv2.findContours(
+            cv2.compare(image, threshold, cv2.CMP_GT), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE
+        )
+        # texture and dust without end: look at what stands out more
+        if len(contours) <= _MAX_PARTS or lift > 0.3 * top:
+            break
+        lift *= 1.6
     above = cv2.compare(image, threshold, cv2.CMP_GT)
-    nodes = _first_nodes(above, threshold, settings, log)
+    nodes = _first_nodes(above, threshold, contours, hierarchy, settings, log)
     found: list[tuple[float, ...]] = []
     visited = 0
     while nodes and visited < _MAX_NODES:
@@ -112,10 +122,10 @@ def find_candidates(
 
 
 def _first_nodes(
-    above: NDArray[np.uint8], threshold: NDArray, settings: DetectionSettings, log: RejectionLog
-) -> list[_Node]:
+    above: NDArray[np.uint8], threshold: NDArray, contours: Sequence[NDArray], hierarchy: NDArray | None,
+    settings: DetectionSettings, log: RejectionLog,
+) -> list[_Node]:  # fmt: skip
     """Connected parts above the background, by contours (fast where there are few), small ones last in the list."""
-    contours, hierarchy = cv2.findContours(above, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
     nodes: list[_Node] = []
     if hierarchy is None:
         return nodes

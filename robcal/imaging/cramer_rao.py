@@ -1,0 +1,51 @@
+"""Least variance with which a dot's centre can be known from one image (Cramer-Rao bound).
+
+For independent normal noise of known variance v per pixel the Fisher information of parameters p of the expected grey
+values m is sum (dm/dp)' (dm/dp) / v; the bound of the centre is the upper left block of its inverse (Kay 1993,
+"Fundamentals of Statistical Signal Processing: Estimation Theory", sec. 3.9).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robcal.errors import InvalidInput
+from robcal.imaging.edge_model import blurred_ellipse, matrix_from_axes
+from robcal.imaging.noise import NoiseModel
+
+Array = NDArray[np.float64]
+
+
+def centre_bound(
+    semi_axes: tuple[float, float], angle: float, blur: float, contrast: float, background: float, noise: NoiseModel,
+    *, phase: tuple[float, float] = (0.0, 0.0), known_shape: bool = False,
+) -> Array:  # fmt: skip
+    """(2, 2) bound of the centre of an evenly bright ellipse on an even background.
+
+    Parameters
+    ----------
+    semi_axes : px. angle : of the first, rad. blur : of the lens, px (the pixel's 1/12 is added).
+    contrast, background : grey values. noise : noise model. phase : of the centre within its pixel, px.
+    known_shape : True if everything but the centre is known; else axes, angle, blur, contrast, background are unknown.
+
+    Raises
+    ------
+    InvalidInput : axes, blur or contrast that are not positive.
+    """
+    if min(semi_axes) <= 0 or blur < 0 or contrast == 0:
+        raise InvalidInput("semi-axes must be positive, blur not negative and contrast not zero")
+    s = float(np.sqrt(blur**2 + 1.0 / 12.0))
+    half = int(np.ceil(max(semi_axes) + 6.0 * s + 2.0))
+    grid = np.arange(-half, half + 1.0)
+    x, y = np.meshgrid(grid, grid)
+    b = matrix_from_axes(np.array([semi_axes], dtype=float), np.array([angle]))
+    shape = np.concatenate([[phase], b, [[np.log(s)]]], axis=1)
+    profile, by_shape = blurred_ellipse(shape, x.reshape(1, -1), y.reshape(1, -1))
+    columns = by_shape[0] * contrast
+    if known_shape:
+        columns = columns[:, :2]
+    else:
+        columns = np.column_stack([columns, profile[0], np.ones(profile.shape[1])])
+    weight = 1.0 / noise.at(background + contrast * profile[0])
+    return np.asarray(np.linalg.inv((columns * weight[:, None]).T @ columns)[:2, :2])
