@@ -98,7 +98,7 @@ class ModelEntry(Entry):
     parameters: Literal["standard", "geometry", "table5.4"] | list[Text] = "standard"
     objective: Literal["maximum_likelihood", "basis_norm"] = "maximum_likelihood"
     robust: bool = False
-    statics: Literal["one_step", "converged"] = "one_step"
+    statics: Literal["one_step", "converged"] = "converged"
     joint_sigma_deg: NotNegative | None = None
 
 

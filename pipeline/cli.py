@@ -177,6 +177,9 @@ def compensate(
     system: Annotated[
         str, typer.Option("--in", metavar="world|base", help="Coordinates of the frames: measuring system or base.")
     ] = "world",
+    skip: Annotated[
+        bool, typer.Option("--skip-unreachable", help="Leave out frames that the robot cannot reach.")
+    ] = False,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
@@ -188,7 +191,10 @@ def compensate(
     with _answers("compensate", as_json) as answer:
         from pipeline.prediction import compensate_run
 
-        answer.update(compensate_run(run_folder, frames, out, as_frames=kind == "frames", in_base=system == "base"))
+        targets, in_base = kind == "frames", system == "base"
+        answer.update(
+            compensate_run(run_folder, frames, out, as_frames=targets, in_base=in_base, skip_unreachable=skip)
+        )
         messages = Messages(quiet)
         for sentence in answer["warnings"]:
             messages.warn(sentence)

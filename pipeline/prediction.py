@@ -68,7 +68,13 @@ def read_wanted(path: Path, payloads: Collection[str]) -> WantedFrames:
 
 
 def compensate_run(
-    folder: Path, frames: Path, out: Path, *, as_frames: bool = False, in_base: bool = False
+    folder: Path,
+    frames: Path,
+    out: Path,
+    *,
+    as_frames: bool = False,
+    in_base: bool = False,
+    skip_unreachable: bool = False,
 ) -> dict[str, Any]:
     """Write the commands that bring the real tool to the wanted frames.
 
@@ -91,29 +97,32 @@ def compensate_run(
         frame="base" if in_base else "world",
     )
     unreachable = np.flatnonzero(~result.reachable)
-    if len(unreachable):
+    if len(unreachable) and (not skip_unreachable or len(unreachable) == len(wanted.T)):
         i = int(unreachable[0])
         count = f" ({len(unreachable)} of {len(wanted.T)} frames)" if len(unreachable) > 1 else ""
         raise InvalidInput(
             f"{frames}: the robot cannot reach frame '{wanted.names[i]}'{count}: {result.reason[i]}: move the frame, "
-            "or check whether it is in the coordinates stated by --in"
+            "check --in (coordinates) and the payload, or leave such frames out with --skip-unreachable"
         )
-    missed = [wanted.names[i] for i in np.flatnonzero(~result.converged)]
-    warnings = [f"{frames}: frame '{name}' is met only approximately (near a singular pose?)" for name in missed]
-    columns: dict[str, Sequence[object]] = {"pose": wanted.names}
+    rows = np.flatnonzero(result.reachable)
+    warnings = [f"{frames}: frame '{wanted.names[i]}' left out: {result.reason[i]}" for i in unreachable]
+    missed = [wanted.names[i] for i in rows if not result.converged[i]]
+    warnings += [f"{frames}: frame '{name}' is met only approximately (near a singular pose?)" for name in missed]
+    columns: dict[str, Sequence[object]] = {"pose": [wanted.names[i] for i in rows]}
     if as_frames:
-        columns.update(frame_columns(result.F_star))
+        columns.update(frame_columns(result.F_star[rows]))
     else:
         for k, (name, factor) in enumerate(joint_columns(model)):
-            columns[name] = [f"{v:.9f}" for v in result.q[:, k] / factor]
+            columns[name] = [f"{v:.9f}" for v in result.q[rows, k] / factor]
     write_table(out, columns)
-    remaining = np.linalg.norm(result.remaining[:, :3], axis=1) * 1000
-    before = np.linalg.norm(result.before[:, :3], axis=1) * 1000
+    remaining = np.linalg.norm(result.remaining[rows, :3], axis=1) * 1000
+    before = np.linalg.norm(result.before[rows, :3], axis=1) * 1000
     return {
-        "frames": len(wanted.T),
+        "frames": len(rows),
+        "left_out": [wanted.names[i] for i in unreachable],
         "out": str(out),
         "remaining_max_mm": float(remaining.max()),
-        "uncompensated_mean_mm": float(before.mean()),
+        "uncompensated_mean_mm": float(np.nanmean(before)),
         "warnings": warnings,
     }
 

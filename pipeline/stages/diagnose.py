@@ -15,7 +15,7 @@ from pipeline.poses_table import Poses
 from pipeline.runs import write_json
 from pipeline.stages.base import Context, Outcome, Stage, no_files
 from pipeline.stages.identify import load_identification, require_robot
-from pipeline.stages.observations import RobotRecording
+from pipeline.stages.observations import RobotRecording, Rows
 from pipeline.tables import write_table
 from robcal.diagnosis.contract import as_contract
 from robcal.diagnosis.diagnose import diagnose
@@ -29,7 +29,7 @@ NAME = "diagnose"
 
 
 def recording_for_diagnosis(
-    poses: Poses, recording: RobotRecording, rows: Array, body: Body | None
+    poses: Poses, recording: RobotRecording, rows: Rows, body: Body | None
 ) -> Recording | None:
     """The measurements of some poses in the form the diagnosis takes: the kind with the most of them."""
     chosen = recording.select(rows, detailed=True)

@@ -42,7 +42,7 @@ def work(context: Context) -> Outcome:
     outputs = [run.save(NAME, frames), run.save("body_used", frames.body), run.frames]
     names = campaign.poses.names
     notes = [*frames.notes, *(f"pose '{names[r.pose]}' rejected: {r.reason}" for r in frames.rejected_poses)]
-    if frames.recurring.statement:
+    if frames.recurring.pairs or frames.recurring.scale_ppm is not None:
         notes.append(f"recurring length deviations, evidence for the diagnosis: {frames.recurring.statement}")
     return Outcome({"points": _result(points, frames)}, outputs, notes)
 

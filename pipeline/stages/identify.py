@@ -15,7 +15,7 @@ from pipeline.poses_table import Poses
 from pipeline.robot_file import write_robot
 from pipeline.runs import Run
 from pipeline.stages.base import Context, Outcome, Stage
-from pipeline.stages.observations import RobotObservations, RobotRecording, build_recording, rescaled
+from pipeline.stages.observations import RobotObservations, RobotRecording, Rows, build_recording, rescaled
 from robcal.calibration.identification import IdentifiedRobot, IdentifyOptions, identify
 from robcal.calibration.observations import FrameObservations
 from robcal.calibration.verification import fit_nominal
@@ -38,7 +38,7 @@ class Identification:
     recording : the measurements, with the uncertainty estimated where none was stated.
     """
 
-    rows: Array
+    rows: Rows
     facts: Mapping[str, Any] = field(repr=False)
     recording: RobotRecording = field(repr=False)
 
@@ -97,7 +97,7 @@ def identify_recording(
     robot: RobotModel,
     inputs: PoseInputs,
     recording: RobotRecording,
-    rows: Array,
+    rows: Rows,
     options: IdentifyOptions,
     kernel: Kernel,
 ) -> tuple[IdentifiedRobot, RobotRecording]:
@@ -147,7 +147,7 @@ def calibrated_robot(
     poses: Poses,
     inputs: PoseInputs,
     recording: RobotRecording,
-    rows: Array,
+    rows: Rows,
     found: IdentifiedRobot,
 ) -> Calibrated:
     """The calibrated robot beside the nominal one in its best cell, with what predictions need."""
@@ -165,13 +165,13 @@ def calibrated_robot(
 
 
 def check_fit(
-    campaign: Campaign, robot: RobotModel, inputs: PoseInputs, recording: RobotRecording, rows: Array,
+    campaign: Campaign, robot: RobotModel, inputs: PoseInputs, recording: RobotRecording, rows: Rows,
     found: IdentifiedRobot,
 ) -> None:
     """Hook for faults of the joint log."""
 
 
-def _result(found: IdentifiedRobot, rows: Array) -> dict[str, Any]:
+def _result(found: IdentifiedRobot, rows: Rows) -> dict[str, Any]:
     return {
         "poses": len(rows),
         "parameters": len(found.names),
@@ -181,13 +181,16 @@ def _result(found: IdentifiedRobot, rows: Array) -> dict[str, Any]:
         "seconds": found.seconds,
         "redundancy": found.redundancy,
         "p_value": found.p_value,
-        "eliminated": {name: str(reason) for name, reason in found.eliminated.items()},
+        "eliminated": {
+            name: {"reason": e.reason, "tied_to": [n for n, share in e.tied_to.items() if abs(share) > 0.05]}
+            for name, e in found.eliminated.items()
+        },
         "outliers": len(found.outliers),
         "correlated": [list(pair) for pair in found.strong_correlations()[:20]],
     }
 
 
-def _notes(found: IdentifiedRobot, poses: Poses, rows: Array) -> list[str]:
+def _notes(found: IdentifiedRobot, poses: Poses, rows: Rows) -> list[str]:
     notes = []
     for i in found.outliers:
         name, error = poses.names[int(rows[i])], found.normalised[i]

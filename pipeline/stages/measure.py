@@ -8,6 +8,7 @@ from pipeline.campaign import Campaign
 from pipeline.poses_table import Poses
 from pipeline.runs import Run
 from pipeline.stages.base import Context, Outcome, Stage
+from pipeline.stages.orient import station_points
 from pipeline.tables import write_table
 from robcal.errors import InvalidInput
 from robcal.photogrammetry.measured_points import MeasuredPoints
@@ -25,12 +26,7 @@ def work(context: Context) -> Outcome:
     campaign, run = context.campaign, context.run
     if campaign.poses is None:
         raise InvalidInput(f"{campaign.path}: no poses: add 'poses: poses.csv'")
-    if campaign.entry.station is not None:
-        from pipeline.stages.orient import station_points
-
-        points = station_points(run)
-    else:
-        points = points_from_tables(campaign)
+    points = station_points(run) if campaign.entry.station is not None else points_from_tables(campaign)
     write_points(run, campaign.poses, points)
     names = campaign.poses.names
     notes = [f"pose '{names[p]}': the rays of the cameras contradict one another" for p in points.inconsistent_poses]

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.campaign import Campaign
 from pipeline.measurement_tables import MeasuredTable
@@ -22,6 +23,7 @@ from robcal.photogrammetry.measure_frames import MeasuredFrames
 from robcal.photogrammetry.measured_points import MeasuredPoints
 from robcal.transforms import Array
 
+Rows = NDArray[np.int64]
 RobotObservations = FrameObservations | PointObservations | DistanceObservations | SensorPointObservations
 
 ASSUMED_SIGMA = 1e-4
@@ -46,11 +48,11 @@ class RobotRecording:
     notes: tuple[str, ...] = field(default=())
 
     @property
-    def poses(self) -> Array:
+    def poses(self) -> Rows:
         """Rows of the poses that have observations."""
         return np.unique(np.concatenate([o.pose for o in self.observations]))
 
-    def select(self, rows: Array, *, detailed: bool = False) -> tuple[RobotObservations, ...]:
+    def select(self, rows: Rows, *, detailed: bool = False) -> tuple[RobotObservations, ...]:
         """Observations of the given poses, renumbered to their order; kinds without any are left out."""
         chosen = [o.subset(rows) for o in (self.detailed if detailed else self.observations)]
         return tuple(o for o in chosen if len(o.pose))

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from pipeline.stages import detect, diagnose, frames, identify, measure, report, survey, verify
+from pipeline.stages import detect, diagnose, frames, identify, measure, orient, report, survey, verify
 from pipeline.stages.base import Stage
 
 STAGES: tuple[Stage, ...] = (
     detect.STAGE,
     survey.STAGE,
+    orient.STAGE,
     measure.STAGE,
     frames.STAGE,
     identify.STAGE,

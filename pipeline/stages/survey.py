@@ -105,7 +105,7 @@ def _check_lengths(campaign: Campaign, name: str, entry: SurveyEntry) -> None:
 
 def _images(run: Run, name: str, source: ImageSource, file: BodyFile) -> tuple[list[SurveyImage], tuple[int, int]]:
     if source.marks is not None:
-        return marks_by_image(source.marks), source.size or _size_of_marks(source.marks)
+        return marks_by_image(source.marks), source.size or size_of_marks(source.marks)
     index: DetectionIndex = run.load("detect")
     key = f"survey/{name}"
     found = load_detections(run, index, key)
@@ -123,7 +123,7 @@ def marks_by_image(table: MarksTable) -> list[SurveyImage]:
     ]
 
 
-def _size_of_marks(table: MarksTable) -> tuple[int, int]:
+def size_of_marks(table: MarksTable) -> tuple[int, int]:
     """Image size where no file tells it: marks are taken to fill the image evenly on all sides."""
     low, high = table.xy.min(axis=0), table.xy.max(axis=0)
     width, height = np.maximum(np.ceil(high + np.maximum(low, 0.0) + 1), 2).astype(int)

@@ -15,7 +15,7 @@ from pipeline.robot_file import write_robot
 from pipeline.runs import Run
 from pipeline.stages.base import Context, Outcome, Stage, no_files
 from pipeline.stages.identify import load_identification, options_of, require_robot
-from pipeline.stages.observations import RobotObservations
+from pipeline.stages.observations import RobotObservations, Rows
 from pipeline.tables import write_table
 from robcal.calibration.identification import IdentifiedRobot
 from robcal.calibration.observations import (
@@ -34,7 +34,6 @@ from robcal.calibration.verification import (
 )
 from robcal.robot.kernel import Kernel, PoseInputs
 from robcal.robot.model import parameter_unit
-from robcal.transforms import Array
 
 NAME = "verify"
 FOLDS = 5
@@ -155,9 +154,9 @@ def _result(outcome: Verification) -> dict[str, Any]:
     return result
 
 
-def load_verification(run: Run) -> tuple[Verification, Array]:
+def load_verification(run: Run) -> tuple[Verification, Rows]:
     """Result of the stage and the rows of the poses it was made on."""
-    found: tuple[Verification, Array] = run.load(NAME)
+    found: tuple[Verification, Rows] = run.load(NAME)
     return found
 
 

@@ -1,0 +1,200 @@
+"""Stage orient: which dot is which target, and where the station's cameras stand."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.bodies import surveyed_or_given
+from pipeline.camera_file import CameraFile, write_camera
+from pipeline.campaign import Campaign, ImageSource
+from pipeline.measurement_tables import MarksTable
+from pipeline.poses_table import Poses
+from pipeline.runs import Run
+from pipeline.stages.base import Context, Outcome, Stage
+from pipeline.stages.detect import DetectionIndex, load_detections
+from pipeline.stages.survey import located, size_of_marks
+from robcal.errors import InvalidInput, RobcalError
+from robcal.imaging.detections import Detections
+from robcal.photogrammetry.bodies import Body
+from robcal.photogrammetry.camera import INTRINSIC_NAMES, Camera
+from robcal.photogrammetry.identify_station import identify_station
+from robcal.photogrammetry.measure_points import measure_points
+from robcal.photogrammetry.measured_points import MeasuredPoints
+from robcal.photogrammetry.station import orient_station
+from robcal.photogrammetry.station_network import StationMarks, StationOrientation
+
+NAME = "orient"
+
+
+def work(context: Context) -> Outcome:
+    """Identify targets in the station's images and orient its cameras."""
+    campaign, run = context.campaign, context.run
+    station, poses = campaign.entry.station, campaign.poses
+    if station is None or poses is None:
+        raise InvalidInput(f"{campaign.path}: no station: add 'station' with its cameras and body")
+    body = surveyed_or_given(campaign, run, station.body)
+    _check_body(campaign, body, station.body)
+    start: dict[str, Camera | None] = {
+        name: source.start.camera if source.start else None for name, source in campaign.cameras.items()
+    }
+    marks, problems = _marks(campaign, run, body, poses, start)
+    notes = _problem_notes(problems, poses)
+    marks = _usable(campaign, marks, body, notes, problems)
+    stated = {
+        name: source.start.world_T_camera
+        for name, source in campaign.cameras.items()
+        if source.start is not None and source.start.world_T_camera is not None and name in marks
+    }
+    sizes = {name: _size(campaign.cameras[name], run, name) for name in marks}
+    try:
+        orientation = orient_station(marks, body, {n: start[n] for n in marks}, sizes, stated)
+    except RobcalError as error:
+        raise located(error, f"{campaign.path}: station") from None
+    outputs = [run.save(NAME, orientation), run.save("marks", marks)]
+    outputs += _write_cameras(campaign, run, orientation)
+    notes += [e.statement for e in orientation.evidence]
+    whole = [r for r in orientation.rejected if r.target < 0]
+    notes += [f"camera {r.camera}, pose '{poses.names[r.pose]}': {r.reason}" for r in whole]
+    return Outcome({"station": _result(orientation, marks)}, outputs, notes)
+
+
+def _check_body(campaign: Campaign, body: Body, name: str) -> None:
+    known = int(body.known.sum())
+    if known < 3:
+        path = campaign.bodies[name].file.path
+        raise InvalidInput(
+            f"{path}: body '{name}' has {known} targets with coordinates, a station needs three or more: "
+            "give coordinates, or a survey of the body"
+        )
+
+
+def _marks(
+    campaign: Campaign, run: Run, body: Body, poses: Poses, start: Mapping[str, Camera | None]
+) -> tuple[dict[str, StationMarks], tuple[tuple[str, int, str], ...]]:
+    place = {name: i for i, name in enumerate(poses.names)}
+    given = {
+        name: _from_table(source.marks, body, place)
+        for name, source in campaign.cameras.items()
+        if source.marks is not None
+    }
+    detections: dict[str, dict[int, Detections]] = {}
+    if any(source.images for source in campaign.cameras.values()):
+        index: DetectionIndex = run.load("detect")
+        for name, source in campaign.cameras.items():
+            if source.images:
+                found = load_detections(run, index, f"station/{name}")
+                detections[name] = {place[image]: targets for image, targets in found.items()}
+    if not detections:
+        return given, ()
+    identified = identify_station(detections, body, start)
+    marks = {name: given.get(name) or identified.marks.get(name) for name in campaign.cameras}
+    return {name: m for name, m in marks.items() if m is not None}, identified.problems
+
+
+def _from_table(table: MarksTable, body: Body, place: Mapping[str, int]) -> StationMarks:
+    listed = body.index(table.target) >= 0
+    if not listed.any():
+        raise InvalidInput(f"{table.path}: none of its targets is on body '{body.name}': check the ids")
+    covariance = table.sigma[listed][:, None, None] ** 2 * np.eye(2)
+    pose = np.array([place[image] for image in table.image], dtype=np.int64)
+    return StationMarks(pose[listed], table.target[listed], table.xy[listed], covariance)
+
+
+def _usable(
+    campaign: Campaign, marks: Mapping[str, StationMarks], body: Body, notes: list[str], problems: Any
+) -> dict[str, StationMarks]:
+    """Cameras with any identified target; none at all is an error that says why."""
+    used = {name: m for name, m in marks.items() if len(m)}
+    for name, source in campaign.cameras.items():
+        if name not in used:
+            why = next((reason for camera, _, reason in problems if camera == name), "no targets found")
+            folder = next(iter(source.images.values())).parent if source.images else name
+            told = f"{folder}: no target of body '{body.name}' identified in any image of camera '{name}': {why}"
+            if not used:
+                raise InvalidInput(f"{told}: are these images of the body, and is it the right body file?")
+            notes.append(told)
+    return used
+
+
+def _problem_notes(problems: tuple[tuple[str, int, str], ...], poses: Poses) -> list[str]:
+    counts = Counter((camera, reason) for camera, _, reason in problems)
+    notes = []
+    for (camera, reason), count in counts.items():
+        names = [poses.names[p] for c, p, r in problems if (c, r) == (camera, reason)]
+        listed = ", ".join(names[:5]) + (", ..." if count > 5 else "")
+        notes.append(f"camera {camera}: nothing identified in {count} images ({listed}): {reason}")
+    return notes
+
+
+def _size(source: ImageSource, run: Run, name: str) -> tuple[int, int]:
+    if source.marks is not None:
+        return source.size or size_of_marks(source.marks)
+    index: DetectionIndex = run.load("detect")
+    return index.of(f"station/{name}")[0].size
+
+
+def _write_cameras(campaign: Campaign, run: Run, orientation: StationOrientation) -> list[Path]:
+    placed = orientation.world_T_camera
+    paths = []
+    for name, camera in zip(orientation.names, orientation.cameras, strict=True):
+        _, interior = orientation.camera_covariance(name)
+        sigma = np.sqrt(np.clip(np.diag(interior), 0, None))
+        start = campaign.cameras[name].start
+        content = CameraFile(
+            camera, placed[name], start.pixel_um if start else None,
+            dict(zip(INTRINSIC_NAMES, map(float, sigma), strict=True)),
+        )  # fmt: skip
+        write_camera(run.camera(name), content, f"oriented in campaign {campaign.name}")
+        paths.append(run.camera(name))
+    return paths
+
+
+def _result(orientation: StationOrientation, marks: Mapping[str, StationMarks]) -> dict[str, Any]:
+    return {
+        "cameras": {
+            name: {
+                "marks": len(marks[name]),
+                "images": len(np.unique(marks[name].pose)),
+                "noise_factor": orientation.noise.get(name),
+                "free_interior": list(orientation.free_interior.get(name, ())),
+            }
+            for name in orientation.names
+        },
+        "poses": len(orientation.poses),
+        "sigma0": orientation.sigma0,
+        "rms_px": orientation.rms_px,
+        "redundancy": orientation.redundancy_total,
+        "rejected": len(orientation.rejected),
+        "evidence": [e.kind for e in orientation.evidence],
+        "converged": orientation.converged,
+    }
+
+
+def station_points(run: Run) -> MeasuredPoints:
+    """Targets in the world from the oriented station and all identified marks."""
+    orientation: StationOrientation = run.load(NAME)
+    marks: dict[str, StationMarks] = run.load("marks")
+    return measure_points(orientation, marks)
+
+
+STAGE = Stage(
+    name=NAME,
+    applies=lambda campaign: campaign.entry.station is not None,
+    work=work,
+    inputs=lambda campaign: [
+        *(body.file.path for body in campaign.bodies.values()),
+        *(source.marks.path for source in campaign.cameras.values() if source.marks is not None),
+        *(source.start_path for source in campaign.cameras.values() if source.start_path is not None),
+    ],
+    settings=lambda campaign: [
+        campaign.entry.model_dump(include={"station"}),
+        list(campaign.poses.names) if campaign.poses else [],
+    ],
+    after=("detect", "survey"),
+    code=("robcal/photogrammetry", "robcal/least_squares.py", "robcal/transforms.py", "pipeline/stages/orient.py"),
+)
