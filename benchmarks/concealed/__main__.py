@@ -34,7 +34,12 @@ from fixtures.recordings import record  # noqa: E402
 
 def run_one(scenario: Scenario, adapter: str) -> dict[str, Any]:
     """Make, run and score one campaign; a failure of the tool is a record with ``error``."""
-    recording, truth = record(scenario.plan)
+    head = {"key": scenario.key, "battery": scenario.battery, "label": scenario.label, "level": scenario.level}
+    head |= {"snr": scenario.snr, "seed": scenario.seed}
+    plan = scenario.build()
+    if plan is None:
+        return {**head, "skipped": "the effect does not show in this campaign"}
+    recording, truth = record(plan)
     with tempfile.TemporaryDirectory(prefix="concealed-") as folder:
         root = Path(folder)
         campaign = write_campaign(recording, root / "campaign")
@@ -45,16 +50,10 @@ def run_one(scenario: Scenario, adapter: str) -> dict[str, Any]:
                 write_poses(kept.poses, truth, tables[name])
         try:
             answer = ADAPTERS[adapter](campaign, tables)
-            return score(scenario, recording, truth, answer)
+            return {**head, **score(scenario, recording, truth, answer)}
         except Exception as error:
             return {
-                "key": scenario.key,
-                "battery": scenario.battery,
-                "label": scenario.label,
-                "level": truth.plan.level,
-                "snr": scenario.snr,
-                "seed": truth.plan.seed,
-                "robot": truth.plan.robot,
+                **head,
                 "error": f"{type(error).__name__}: {error}",
                 "traceback": traceback.format_exc()[-1500:],
                 "truth": [e.as_dict() for e in truth.effects],
@@ -93,8 +92,7 @@ def _run(arguments: argparse.Namespace) -> list[dict[str, Any]]:
                     stream.flush()
                 if not arguments.quiet:
                     print(
-                        f"{number}/{len(pending)} {time.perf_counter() - start:6.0f} s  {_line(result)}",
-                        file=sys.stderr,
+                        f"{number}/{len(pending)} {time.perf_counter() - start:.0f} s {_line(result)}", file=sys.stderr
                     )
     finally:
         if stream:
@@ -103,12 +101,15 @@ def _run(arguments: argparse.Namespace) -> list[dict[str, Any]]:
 
 
 def _line(result: dict[str, Any]) -> str:
+    if "skipped" in result:
+        return f"{result['key']}: {result['skipped']}"
     if "error" in result:
         return f"{result['key']}: {result['error'][:150]}"
     told = ", ".join(f"{c['cause']}@{c['where']}{c['direction'] or ''}" for c in result["answer"]) or "nothing"
     true = ", ".join(f"{e['cause']}@{e['where']}{e['direction'] or ''}" for e in result["truth"]) or "nothing"
     mark = {True: "right", False: "WRONG", None: ""}[result.get("name_right", result.get("exact"))]
-    return f"{result['label']} SNR {result['snr']} ({result['robot']}): {true} -> {told} {mark} [{result['seconds']:.1f} s]"
+    what = f"{result['label']} SNR {result['snr']} ({result['robot']})"
+    return f"{what}: {true} -> {told} {mark} [{result['seconds']:.1f} s]"
 
 
 def main() -> int:

@@ -122,10 +122,8 @@ class Equivalence:
         elif cause in ("joint_eccentricity", "axis_wobble", "gear_ripple"):
             told = (answer.get("parameters") or {}).get("order")
             usual = (1, 2) if cause == "joint_eccentricity" else (1, 2, 3) if cause == "axis_wobble" else (3, 4, 5)
-            for order in [
-                *({int(round(float(told)))} if told else usual),
-                *([int(effect.value("order"))] if "order" in effect.parameters and not told else []),
-            ]:
+            orders = [round(float(told))] if told else [*usual, int(effect.value("order", usual[0]))]
+            for order in orders:
                 yield wave(order)
         elif cause == "counterbalance":
             yield wave(1, 5.0)

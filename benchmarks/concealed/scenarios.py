@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -21,21 +22,24 @@ URAD = 1e-6
 
 @dataclass(frozen=True)
 class Scenario:
-    """One campaign to be made: its battery, a label within it, the plan, the SNR aimed at (None for nulls).
+    """One campaign to be made.
 
-    ``together``: causes of which the tool has to say that it cannot tell them apart (inseparable pairs).
+    ``build`` makes its plan when it is needed (None where the effect cannot show in it). ``snr`` is what is aimed at
+    (None for nulls and mixtures). ``together``: causes of which the tool has to say that it cannot tell them apart.
     """
 
     battery: str
     label: str
-    plan: Plan
-    snr: float | None = None
+    level: str
+    seed: int
+    snr: float | None
+    build: Callable[[], Plan | None]
     together: tuple[str, ...] = ()
 
     @property
     def key(self) -> str:
         """Unique name, also for resuming."""
-        return f"{self.battery}/{self.label}/{self.plan.level}/{self.plan.robot}/{self.plan.seed}/{self.snr}"
+        return f"{self.battery}/{self.label}/{self.level}/{self.seed}/{self.snr}"
 
 
 def _plan(seed: int, level: str, robot: str | None = None, noise: Noise | None = None) -> Plan:
@@ -54,22 +58,24 @@ def noise_of(robot: str) -> Noise:
 
 def nulls(count: int, seed: int, level: str) -> Iterator[Scenario]:
     """Nothing is missing; the noise is plain, has joint repeatability, heavy tails, is misstated, or has blunders."""
+    kinds = ["plain", "repeatability", "heavy tails", "understated", "overstated"]
     for i in range(count):
-        plan = _plan(seed + i, level)
-        rng = np.random.default_rng([seed + i, 50])
-        n = plan.noise
-        understated, overstated = (float(rng.uniform(1.1, 1.2)) for _ in range(2))
-        kinds = {
-            "plain": n,
-            "repeatability": replace(n, joint_repeatability_rad=20 * URAD),
-            "heavy tails": replace(n, tails=5.0),
-            "understated": replace(n, stated_factor=1.0 / understated),
-            "overstated": replace(n, stated_factor=overstated),
-        }
-        if level == "points":
-            kinds["single blunders"] = replace(n, blunder_share=0.004)
-        for label, noise in kinds.items():
-            yield Scenario("nulls", label, replace(plan, noise=noise))
+        for label in [*kinds, *(["single blunders"] if level == "points" else [])]:
+            yield Scenario("nulls", label, level, seed + i, None, partial(_null, seed + i, level, label))
+
+
+def _null(seed: int, level: str, label: str) -> Plan:
+    plan = _plan(seed, level)
+    off = float(np.random.default_rng([seed, 50]).uniform(1.1, 1.2))
+    changes: dict[str, dict[str, float]] = {
+        "plain": {},
+        "repeatability": {"joint_repeatability_rad": 20 * URAD},
+        "heavy tails": {"tails": 5.0},
+        "understated": {"stated_factor": 1.0 / off},
+        "overstated": {"stated_factor": off},
+        "single blunders": {"blunder_share": 0.004},
+    }
+    return replace(plan, noise=replace(plan.noise, **changes[label]))
 
 
 def singles(count: int, seed: int, level: str) -> Iterator[Scenario]:
@@ -77,12 +83,10 @@ def singles(count: int, seed: int, level: str) -> Iterator[Scenario]:
     for i in range(count):
         for number, cause in enumerate(BY_LEVEL[level]):
             for k, snr in enumerate(SNR_CLASSES):
-                plan = _plan(seed + 1000 * i + 10 * number + k, level)
                 if cause == "target_swapped" and k:
                     continue
-                drawn = _drawn(plan, cause, snr)
-                if drawn is not None:
-                    yield Scenario("singles", cause, drawn, snr)
+                own = seed + 1000 * i + 10 * number + k
+                yield Scenario("singles", cause, level, own, snr, partial(_single, own, level, cause, snr))
 
 
 def outside(count: int, seed: int, level: str) -> Iterator[Scenario]:
@@ -90,92 +94,94 @@ def outside(count: int, seed: int, level: str) -> Iterator[Scenario]:
     for i in range(count):
         for number, cause in enumerate(OUTSIDE):
             for k, snr in enumerate((8.0, 12.0, 20.0)):
-                drawn = _drawn(_plan(seed + 1000 * i + 10 * number + k, level), cause, snr)
-                if drawn is not None:
-                    yield Scenario("outside", cause, drawn, snr)
+                own = seed + 1000 * i + 10 * number + k
+                yield Scenario("outside", cause, level, own, snr, partial(_single, own, level, cause, snr))
+
+
+def _single(seed: int, level: str, cause: str, snr: float) -> Plan | None:
+    return _drawn(_plan(seed, level), cause, snr)
 
 
 def mixtures(count: int, seed: int, level: str) -> Iterator[Scenario]:
-    """Two or three causes at once that can be told apart (none lies within 0.95 of the span of the others)."""
-    pool = [c for c in BY_LEVEL[level] if c not in NARROWING and c not in ("target_swapped", "camera_moved")]
+    """Two or three causes at once that can be told apart (none lies within 0.7 of the span of the others)."""
     for i in range(count):
         for size in (2, 3):
-            rng = np.random.default_rng([seed + i, 60, size])
-            for _ in range(10):
-                plan = _plan(seed + i, level)
-                causes = [str(c) for c in rng.choice(pool, size, replace=False)]
-                try:
-                    for number, cause in enumerate(causes):
-                        plan, effect = draw_effect(plan, cause, number=number, snr=float(rng.uniform(10, 25)))
-                        plan = replace(plan, effects=(*plan.effects, effect))
-                except NotDrawable:
-                    continue
-                if _separable(plan):
-                    yield Scenario("mixtures", str(size), plan, None)
-                    break
+            yield Scenario("mixtures", str(size), level, seed + i, None, partial(_mixture, seed + i, level, size))
+
+
+def _mixture(seed: int, level: str, size: int) -> Plan | None:
+    pool = [c for c in BY_LEVEL[level] if c not in NARROWING and c not in ("target_swapped", "camera_moved")]
+    rng = np.random.default_rng([seed, 60, size])
+    for _ in range(10):
+        plan = _plan(seed, level)
+        try:
+            for number, cause in enumerate(str(c) for c in rng.choice(pool, size, replace=False)):
+                plan, effect = draw_effect(plan, cause, number=number, snr=float(rng.uniform(10, 25)))
+                plan = replace(plan, effects=(*plan.effects, effect))
+        except NotDrawable:
+            continue
+        if _separable(plan):
+            return plan
+    return None
 
 
 def inseparable(count: int, seed: int, level: str) -> Iterator[Scenario]:
     """Pairs whose signatures coincide on the recorded poses: the tool has to say so."""
+    wave = {"order": 1, "amplitude_deg": 0.01, "phase_deg": 35.0}
     for i in range(count):
-        plan = plan_of(seed=seed + i, robot="kr150", level=level)
-        width = Effect("hysteresis", "axis1", None, {"width_deg": 0.02})
-        lag = ("backlash", "hysteresis")
-        yield Scenario(
-            "inseparable", "lag of an unloaded axis", replace(plan, effects=(_scaled(plan, width, 12),)), 12, lag
-        )
-        moved = ("base_moved", "camera_moved")
-        drawn = _drawn(plan, "base_moved", 15.0)
-        if drawn is not None:
-            yield Scenario("inseparable", "base or station moved", drawn, 15.0, moved)
-        short = replace(plan, axis_ranges={"axis2": 0.25})
+        own = seed + i
+        plan = partial(plan_of, seed=own, robot="kr150", level=level)
+        lag = Effect("hysteresis", "axis1", None, {"width_deg": 0.02})
         ratio = Effect("transmission_ratio", "axis2", None, {"ratio_error_ppm": 500.0})
-        yield Scenario(
-            "inseparable",
-            "axis 2 on a short range",
-            replace(short, effects=(_scaled(short, ratio, 10),)),
-            10,
-            ("transmission_ratio", "joint_eccentricity"),
-        )
-        wave = {"order": 1, "amplitude_deg": 0.01, "phase_deg": 35.0}
-        one_load = replace(plan, payloads=("dumbbell",))
         eccentric = Effect("joint_eccentricity", "axis2", None, wave)
         yield Scenario(
-            "inseparable",
-            "eccentricity or balancing torque",
-            replace(one_load, effects=(_scaled(one_load, eccentric, 12),)),
-            12,
+            "inseparable", "lag of an unloaded axis", level, own, 12.0, partial(_sized, plan, lag, 12.0),
+            ("backlash", "hysteresis"),
+        )  # fmt: skip
+        yield Scenario(
+            "inseparable", "base or station moved", level, own, 15.0,
+            partial(_single, own, level, "base_moved", 15.0), ("base_moved", "camera_moved"),
+        )  # fmt: skip
+        yield Scenario(
+            "inseparable", "axis 2 on a short range", level, own, 10.0,
+            partial(_sized, partial(plan, axis_ranges={"axis2": 0.25}), ratio, 10.0),
+            ("transmission_ratio", "joint_eccentricity"),
+        )  # fmt: skip
+        yield Scenario(
+            "inseparable", "eccentricity or balancing torque", level, own, 12.0,
+            partial(_sized, partial(plan, payloads=("dumbbell",)), eccentric, 12.0),
             ("joint_eccentricity", "counterbalance"),
-        )
+        )  # fmt: skip
 
 
 def decoys(count: int, seed: int, level: str) -> Iterator[Scenario]:
     """True causes whose variable is tied to that of a false one, and single gross errors that are no cause."""
     for i in range(count):
-        base = _plan(seed + i, level)
-        sorted_poses = replace(base, order="axis1")
-        yield from _decoy(
-            "poses sorted by axis 1",
-            sorted_poses,
-            Effect("joint_eccentricity", "axis1", None, {"order": 2, "amplitude_deg": 0.01, "phase_deg": 20.0}),
-            12.0,
-        )
-        tied = replace(base, approach="angle")
-        yield from _decoy(
-            "approach tied to the angle",
-            tied,
-            Effect("joint_eccentricity", "axis3", None, {"order": 2, "amplitude_deg": 0.01, "phase_deg": -50.0}),
-            12.0,
-        )
+        own = seed + i
+        by_order = Effect("joint_eccentricity", "axis1", None, {"order": 2, "amplitude_deg": 0.01, "phase_deg": 20.0})
+        by_angle = Effect("joint_eccentricity", "axis3", None, {"order": 2, "amplitude_deg": 0.01, "phase_deg": -50.0})
+        for label, effect, change in (
+            ("poses sorted by axis 1", by_order, {"order": "axis1"}),
+            ("approach tied to the angle", by_angle, {"approach": "angle"}),
+        ):
+            plan = partial(_changed, own, level, change)
+            yield Scenario("decoys", label, level, own, 12.0, partial(_sized, plan, effect, 12.0))
         if level == "points":
-            yield Scenario(
-                "decoys", "one bad target in a few poses", replace(base, noise=replace(base.noise, blunder_share=0.01))
-            )
+            yield Scenario("decoys", "a bad target in a few poses", level, own, None, partial(_blunders, own, level))
 
 
-def _decoy(label: str, plan: Plan, effect: Effect, snr: float) -> Iterator[Scenario]:
-    scaled = _scaled(plan, effect, snr)
-    yield Scenario("decoys", label, replace(plan, effects=(scaled,)), snr)
+def _changed(seed: int, level: str, change: dict[str, str]) -> Plan:
+    return replace(_plan(seed, level), **change)  # type: ignore[arg-type]
+
+
+def _blunders(seed: int, level: str) -> Plan:
+    plan = _plan(seed, level)
+    return replace(plan, noise=replace(plan.noise, blunder_share=0.01))
+
+
+def _sized(make: Callable[[], Plan], effect: Effect, snr: float) -> Plan:
+    plan = make()
+    return replace(plan, effects=(_scaled(plan, effect, snr),))
 
 
 def _scaled(plan: Plan, effect: Effect, snr: float) -> Effect:

@@ -24,13 +24,7 @@ def score(scenario: Scenario, recording: Recording, truth: Truth, answer: Answer
     design = Design.of(truth)
     equal = Equivalence(truth, design)
     record: dict[str, Any] = {
-        "key": scenario.key,
-        "battery": scenario.battery,
-        "label": scenario.label,
-        "level": truth.plan.level,
         "robot": truth.plan.robot,
-        "seed": truth.plan.seed,
-        "snr": scenario.snr,
         "seconds": answer.seconds,
         "mismatch": answer.mismatch,
         "p_value": answer.diagnosis.get("p_value"),

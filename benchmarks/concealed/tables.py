@@ -175,7 +175,7 @@ def report(records: Sequence[Record]) -> str:
     parts = []
     for (battery, level), group in _groups(records, lambda r: (r["battery"], r["level"])):
         failed = [r for r in group if "error" in r]
-        done = [r for r in group if "error" not in r]
+        done = [r for r in group if "error" not in r and "skipped" not in r]
         parts.append(f"### {battery}, {level}\n")
         if done:
             seconds = [r["seconds"] for r in done]
