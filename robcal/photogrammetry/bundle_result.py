@@ -58,7 +58,8 @@ def finish(
             used = np.einsum("ka,ab,kb->k", J, Q[k:, k:], J) / problem.bars.sigma**2
             redundancy = float(np.sum(1.0 - used))
             if redundancy > _BARS_REDUNDANCY:
-                bars_grown = max(float(np.sqrt(np.sum(bars.r**2) / redundancy)), 1e-3)
+                # a bar's certificate is never made better than it says
+                bars_grown = max(float(np.sqrt(np.sum(bars.r**2) / redundancy)), 1.0 / bars_sigma0)
         alone = groups == 1 and len(stated_sigma) == 0
         if alone or (np.max(np.abs(grown - 1.0)) < 2e-3 and abs(bars_grown - 1.0) < 2e-2):
             break

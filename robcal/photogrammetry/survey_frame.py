@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from robcal.photogrammetry.datum import spans_triangle
+from robcal.photogrammetry.network import IntArray
 from robcal.transforms import Array, fit_frame, invert, transform
 
 
@@ -51,7 +52,7 @@ def fit_similarity(p_new: Array, p_old: Array, *, with_scale: bool, rounds: int 
     return Similarity(scale, T, f"fitted onto the given coordinates of {len(p_new)} targets")
 
 
-def principal_frame(points: Array, station_centres: Array, ids: Array) -> Similarity:
+def principal_frame(points: Array, station_centres: Array, ids: IntArray) -> Similarity:
     """Origin in the centroid, x and y along the two largest spreads, z towards the cameras (right-handed).
 
     The sense of x: the target with the lowest id has x >= 0. Weakness: for a square or round body the directions
@@ -73,9 +74,7 @@ def principal_frame(points: Array, station_centres: Array, ids: Array) -> Simila
     return Similarity(1.0, T, "origin in the centroid, axes along the principal directions")
 
 
-def body_frame(
-    points: Array, ids: Array, given: Array, station_centres: Array, *, with_scale: bool
-) -> Similarity:
+def body_frame(points: Array, ids: IntArray, given: Array, station_centres: Array, *, with_scale: bool) -> Similarity:
     """Frame for points (t, 3) with given coordinates (t, 3; NaN where unknown).
 
     ``with_scale``: the scale is still free and is taken from given coordinates (two suffice for it).

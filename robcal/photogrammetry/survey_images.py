@@ -15,7 +15,7 @@ from robcal.photogrammetry.survey_matching import Sightings
 from robcal.transforms import Array
 
 if TYPE_CHECKING:
-    from robcal.photogrammetry.survey import BodyTarget, SurveyImage
+    from robcal.photogrammetry.survey_types import BodyTarget, SurveyImage
 
 
 @dataclass
@@ -101,8 +101,8 @@ def collect(images: Sequence[SurveyImage], targets: Sequence[BodyTarget], bars: 
     if len(names) < 2:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in unused[:5])
         raise DegenerateGeometry(
-            f"only {len(names)} of {len(images)} images can be used ({reasons or 'none given'}): a survey needs at least "
-            "three, better twenty from all sides"
+            f"only {len(names)} of {len(images)} images can be used ({reasons or 'none given'}): a survey needs "
+            "at least three, better twenty from all sides"
         )
     often = {code: count for code, count in unknown_codes.items() if count >= 3}
     if often:

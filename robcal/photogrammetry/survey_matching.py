@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from robcal.photogrammetry.camera import Camera, normalise, project, project_with_jacobians
@@ -70,6 +71,17 @@ class Geometry:
             self.intrinsics_covariance,
         )
 
+    def with_stations(self, camera_T_body: Array, covariance: Array) -> Geometry:
+        """The same points with more cameras."""
+        return Geometry(
+            self.camera,
+            np.concatenate([self.camera_T_body, camera_T_body]),
+            self.points,
+            np.concatenate([self.pose_covariance, covariance]),
+            self.points_covariance,
+            self.intrinsics_covariance,
+        )
+
     def predict(self, image: int) -> tuple[Array, Array]:
         """Image points (t, 2) and their standard deviations (t,), larger axis; NaN where not in the picture.
 
@@ -90,7 +102,7 @@ class Geometry:
         return xy, sigma
 
 
-def facing(geometry: Geometry, normals: Array, image: int, limit: float = 0.1) -> Array:
+def facing(geometry: Geometry, normals: Array, image: int, limit: float = 0.1) -> NDArray[np.bool_]:
     """(t,) true where a point's front may be seen; unknown normals and planes (sign open) always may."""
     T = geometry.camera_T_body[image]
     p = transform(T, geometry.points)
@@ -196,7 +208,7 @@ def find_new_points(
         candidates = np.concatenate(hypotheses) if hypotheses else np.zeros((0, 3))
         found = 0
         if len(candidates):
-            accepted = _accept(geometry, sightings, free, candidates, gate, min_images)
+            accepted = _accept(geometry, sightings, free, candidates, view, gate, min_images)
             for point, C, rows in accepted:
                 points.append(point)
                 covariances.append(C)
@@ -212,9 +224,7 @@ def _by_load(images: IntArray, n: int) -> list[int]:
     return [int(i) for i in np.argsort(-np.bincount(images, minlength=n), kind="stable")]
 
 
-def _meeting(
-    a: Array, rays_a: Array, b: Array, rays_b: Array, tolerance: float, centre: Array, radius: float
-) -> Array:
+def _meeting(a: Array, rays_a: Array, b: Array, rays_b: Array, tolerance: float, centre: Array, radius: float) -> Array:
     """Points (q, 3) where rays from a (p, 3) and from b (s, 3) pass within ``tolerance`` rad inside the sphere."""
     base = b - a
     dot = rays_a @ rays_b.T
@@ -234,12 +244,16 @@ def _meeting(
 def _accept(
     geometry: Geometry,
     sightings: Sightings,
-    free: Array,
+    free: NDArray[np.bool_],
     candidates: Array,
+    view: Array,
     gate: float,
     min_images: int,
 ) -> list[tuple[Array, Array, IntArray]]:
-    """Candidates that enough images support, best supported first, every detection used once."""
+    """Candidates that enough images support, best supported first, every detection used once.
+
+    ``view`` (n, 3): unit directions from the body to the cameras.
+    """
     n = len(geometry.camera_T_body)
     size = np.array([geometry.camera.width, geometry.camera.height])
     hits = np.full((len(candidates), n), -1, dtype=np.int64)
@@ -252,7 +266,8 @@ def _accept(
         if len(rows) == 0 or not inside.any():
             continue
         at = np.flatnonzero(inside)
-        distance, nearest = cKDTree(sightings.xy[rows]).query(xy[at], distance_upper_bound=1.5 * gate)
+        distance, found = cKDTree(sightings.xy[rows]).query(xy[at], distance_upper_bound=1.5 * gate)
+        nearest = np.asarray(found, dtype=np.int64)
         close = np.isfinite(distance)
         hits[at[close], j] = rows[nearest[close]]
     support = np.count_nonzero(hits >= 0, axis=1)
@@ -269,8 +284,10 @@ def _accept(
         fitted = _fit_point(geometry, sightings, candidates[c], rows, gate)
         if fitted is None or len(fitted[2]) < min_images:
             continue
-        # a point on the back is rightly unseen in up to two thirds of the pictures; an accidental meeting in nearly all
-        if len(fitted[2]) < 0.25 * np.count_nonzero(seen[c]):
+        # pictures from about the same side should show it too; an accidental meeting of rays is seen by few of them
+        mean_view = view[sightings.image[fitted[2]]].sum(axis=0)
+        beside = view @ (mean_view / np.linalg.norm(mean_view)) > np.cos(np.radians(40.0))
+        if len(fitted[2]) < 0.5 * np.count_nonzero(seen[c] & beside):
             continue
         for row in fitted[2].tolist():
             claimed[row] = int(c)
