@@ -12,10 +12,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy import linalg, stats
 
-from robcal.errors import InvalidInput
+from robcal.errors import InvalidInput, NotIdentifiable
 from robcal.robot.model import ANGLE_OF_AXIS, ELASTIC_KINDS, GEOMETRIC_KINDS, RobotModel
 from robcal.robot.statics import moment_names
 from robcal.robot.terms import identifier
@@ -26,6 +26,9 @@ PLAUSIBLE_LENGTH = 2e-3
 """A length deviation (m) that the data determine worse than this is left at nominal."""
 PLAUSIBLE_ANGLE = 2e-3
 """The same for angles (rad), and for what an elasticity turns its angle at the largest moment met."""
+
+SAME_POSE = 1e-4
+"""Joint angles (rad) within which poses count as repetitions of one another."""
 
 OWN_AXIS_LEVEL = 0.05
 """An elasticity about the joint's own axis stays unless its F-test gives a p-value above this: it is known to exist."""
@@ -212,3 +215,31 @@ def observability_indices(singular_values: Array) -> dict[str, float]:
         "O4": float(s[-1] ** 2 / s[0]),
         "O5": float(1.0 / np.sum(1.0 / s)),
     }
+
+
+def repetitions(q: ArrayLike, tolerance: float = SAME_POSE) -> NDArray[np.int64]:
+    """Labels (n,) of poses; those whose joint angles agree within the tolerance (after rounding) share one."""
+    rounded = np.round(np.asarray(q, dtype=float) / tolerance).astype(np.int64)
+    if len(rounded) == 0:
+        return np.zeros(0, dtype=np.int64)
+    return np.unique(rounded, axis=0, return_inverse=True)[1].ravel()
+
+
+def check_poses(q: Array, rows: int, parameters: Sequence[str]) -> None:
+    """Refuse data that cannot determine the parameters.
+
+    Raises
+    ------
+    NotIdentifiable : all poses alike, or no more measured numbers than parameters.
+    """
+    distinct = int(repetitions(q, 1e-3).max(initial=-1)) + 1
+    if distinct < 2:
+        raise NotIdentifiable(
+            f"all {len(q)} poses are alike: nothing about the joints can be identified, move every joint", parameters
+        )
+    if rows <= len(parameters):
+        raise NotIdentifiable(
+            f"{len(q)} poses ({distinct} distinct) give {rows} measured numbers for {len(parameters)} or more "
+            "parameters: measure more poses or choose fewer parameters (model: parameters)",
+            parameters,
+        )

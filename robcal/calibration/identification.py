@@ -19,6 +19,7 @@ from scipy import stats
 from robcal import transforms as tf
 from robcal.calibration.identifiability import (
     Candidates,
+    check_poses,
     choose_by_evidence,
     choose_candidates,
     observability_indices,
@@ -176,8 +177,12 @@ def identify(
         kernel.function("jacobian")
     seconds_kernel = time.perf_counter() - clock
     if options.objective == "basis":
-        observations = [basis_points(o) if isinstance(o, FrameObservations) else o for o in observations]
+        as_points: list[Observations] = []
+        for o in observations:
+            as_points.append(basis_points(o) if isinstance(o, FrameObservations) else o)
+        observations = as_points
     stack = Stack(observations, len(poses))
+    check_poses(poses.q, stack.rows, ())
     evaluator = Evaluator(kernel, poses, stack)
     state = start_state(evaluator, observations)
     choice = choose_candidates(model, options.parameters)
@@ -339,6 +344,7 @@ class _Engine:
         if not kept:
             raise NotIdentifiable("the measurements do not depend on any parameter of the robot", names)
         stay = [names[k] for k in kept]
+        check_poses(self.poses.q, int(weights.astype(bool) @ self.stack.used.sum(axis=1)) + len(self.priors), stay)
         old = {n: e for n, e in (before or {}).items() if n not in stay}
         return stay, old | {e.name: e for e in gone}
 

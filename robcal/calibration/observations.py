@@ -59,8 +59,9 @@ class _Rows:
             value = np.asarray(getattr(self, name), dtype=float)
             if value.shape != (len(pose), *shape):
                 raise InvalidInput(f"{kind}: {name} has shape {value.shape}, expected {(len(pose), *shape)}")
-            bad = np.flatnonzero(~np.all(np.isfinite(value.reshape(len(pose), -1)), axis=1)) if len(pose) else []
-            if len(bad):
+            finite = np.isfinite(value).reshape(len(pose), int(np.prod(shape))).all(axis=1)
+            bad = np.flatnonzero(~finite)
+            if bad.size:
                 raise InvalidInput(f"{kind}: {name} of row {bad[0]} (counted from 0) is not finite: remove the row")
             object.__setattr__(self, name, value)
 

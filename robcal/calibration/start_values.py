@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import permutations, product
+from typing import Any
 
 import cv2
 import numpy as np
@@ -32,6 +33,8 @@ from robcal.photogrammetry.camera import normalise
 
 Array = NDArray[np.float64]
 Pair = tuple[Array, Array]
+PointRows = tuple[NDArray[Any], NDArray[Any], Array, Array]
+"""Rows of points: pose, target, coordinates on the tool, coordinates in the world."""
 
 OUTLIER_FACTOR = 6.0
 
@@ -127,7 +130,7 @@ def _one_target(T: Array, p: Array) -> list[tuple[Array, Array]]:
     for x in starts:
         try:
             found.append(_alternate(R, t, p, x))
-        except DegenerateGeometry:
+        except RobcalError:
             continue
         if found[-1][0] < 0.01 * max(reach, 1e-9):
             break
@@ -162,18 +165,17 @@ def _from_points(base_T_flange: Array, pose: Array, target: Array, p_tool: Array
     places: dict[object, tuple[Array, Array]] = {}
     for main in ids[np.argsort(-counts)][:1]:
         rows = target == main
-        for W, x in _one_target(base_T_flange[pose[rows]], p_world[rows]):
+        for W, _ in _one_target(base_T_flange[pose[rows]], p_world[rows]):
             places.clear()
             for other in ids:
                 mine = target == other
                 back = tf.transform(tf.invert(W @ base_T_flange[pose[mine]]), p_world[mine])
                 places[other] = (np.median(back, axis=0), p_tool[mine][0])
             on_flange, in_tool = (np.array(v) for v in zip(*places.values(), strict=True))
-            try:
-                F = tf.fit_frame(on_flange, in_tool)
-            except RobcalError:
-                F = tf.frame(np.eye(3), x - p_tool[rows][0])
-            out.append((W, F))
+            # turns that the targets leave open (about a point or a line) are any
+            spread = (on_flange - on_flange.mean(axis=0)).T @ (in_tool - in_tool.mean(axis=0))
+            R = _rotation(spread) if len(places) > 1 else np.eye(3)
+            out.append((W, tf.frame(R, (on_flange - in_tool @ R.T).mean(axis=0))))
     return out
 
 
@@ -255,8 +257,8 @@ def _resections(o: PixelObservations) -> list[tuple[int, Array]]:
     return out
 
 
-def _all_points(observations: Sequence[Observations]) -> tuple[Array, Array, Array, Array] | None:
-    parts: list[tuple[Array, Array, Array, Array]] = []
+def _all_points(observations: Sequence[Observations]) -> PointRows | None:
+    parts: list[PointRows] = []
     for o in observations:
         if isinstance(o, PointObservations):
             parts.append((o.pose, o.target, o.p_tool, o.p_world))
@@ -271,7 +273,7 @@ def _all_points(observations: Sequence[Observations]) -> tuple[Array, Array, Arr
     return pose, target, p_tool, p_world
 
 
-def _intersections(o: PixelObservations) -> tuple[Array, Array, Array, Array]:
+def _intersections(o: PixelObservations) -> PointRows:
     """Points seen by two or more cameras, as the points nearest to their rays."""
     rays: dict[tuple[int, tuple[float, ...]], list[tuple[Array, Array]]] = {}
     ideal = np.concatenate([np.zeros((len(o.pose), 2)), np.ones((len(o.pose), 1))], axis=1)
@@ -294,8 +296,8 @@ def _intersections(o: PixelObservations) -> tuple[Array, Array, Array, Array]:
             rows_out.append((pose, names.setdefault(place, len(names)), place, p))
     if not rows_out:
         return np.zeros(0, dtype=int), np.zeros(0, dtype=int), np.zeros((0, 3)), np.zeros((0, 3))
-    pose, target, p_tool, p_world = (np.array(column) for column in zip(*rows_out, strict=True))
-    return pose, target, p_tool, p_world
+    columns = [np.array(column) for column in zip(*rows_out, strict=True)]
+    return columns[0], columns[1], columns[2], columns[3]
 
 
 def _orientations() -> list[Array]:

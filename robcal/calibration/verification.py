@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
 from robcal import transforms as tf
+from robcal.calibration.identifiability import repetitions
 from robcal.calibration.identification import IdentifiedRobot, IdentifyOptions, identify, predict_frames
 from robcal.calibration.observations import (
     DistanceObservations,
@@ -23,7 +24,7 @@ from robcal.calibration.observations import (
     SensorPointObservations,
     Stack,
 )
-from robcal.calibration.problem import joint_scatter, State
+from robcal.calibration.problem import State, joint_scatter
 from robcal.errors import InvalidInput, NotIdentifiable
 from robcal.robot.kernel import Kernel, PoseInputs
 from robcal.robot.model import RobotModel
@@ -36,9 +37,6 @@ TEST_VECTORS: Mapping[str, tuple[float, float, float]] = {
     "1000": (0.4, 0.4, 0.8),
 }
 """Test vectors on the tool in m, by the names of the thesis' Table 5.1."""
-
-SAME_POSE = 1e-4
-"""Joint angles (rad) within which poses count as repetitions of one another."""
 
 
 @dataclass(frozen=True)
@@ -219,12 +217,6 @@ def cross_validate(
     return _verification(
         "cross-validation", poses, merged[0], merged[1], square, degrees, C_T, T_all, observations, rows
     )
-
-
-def repetitions(q: ArrayLike, tolerance: float = SAME_POSE) -> NDArray[np.int64]:
-    """Labels (n,) of poses; those whose joint angles agree within the tolerance (after rounding) share one."""
-    rounded = np.round(np.asarray(q, dtype=float) / tolerance).astype(np.int64)
-    return np.unique(rounded, axis=0, return_inverse=True)[1].ravel()
 
 
 def _normalised(

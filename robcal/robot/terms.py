@@ -94,6 +94,7 @@ def parse(expression: str) -> ast.expr:
     return tree
 
 
+@lru_cache(maxsize=8192)
 def names_in(expression: str) -> frozenset[str]:
     """Names of variables and parameters that occur in an expression (functions excluded)."""
     tree = parse(expression)
