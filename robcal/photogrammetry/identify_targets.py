@@ -1,0 +1,216 @@
+"""Which dot is which target: ring codes and markers first, then geometry, in one image of a station."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from robcal.errors import DegenerateGeometry
+from robcal.imaging.detections import Detections, TargetKind
+from robcal.photogrammetry.bodies import Body, IntArray
+from robcal.photogrammetry.camera import Camera, project, project_with_jacobians
+from robcal.photogrammetry.eccentric_circle import effective_point
+from robcal.photogrammetry.identify_search import Found, match_dots, search_body
+from robcal.photogrammetry.resection import refine_poses, resect
+from robcal.transforms import Array, skew, transform
+
+_GATE = 5.0
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Where the body is expected before the camera: ``camera_T_body`` (4, 4), ``covariance`` (6, 6) or None and the
+    error in the image (px) beyond that covariance."""
+
+    camera_T_body: Array
+    covariance: Array | None = None
+    error_px: float = 3.0
+
+
+@dataclass(frozen=True)
+class IdentifiedImage:
+    """Targets identified in one image.
+
+    Attributes
+    ----------
+    rows : (k,) rows of the detections; ids : (k,) target ids.
+    camera_T_body : pose found on the way, None where only codes were read.
+    method : 'codes', 'prediction', 'search' or 'none'.
+    alternatives : other poses (with other numberings) that fit as well; then nothing is identified.
+    reason : why nothing was identified, else empty.
+    """
+
+    rows: IntArray
+    ids: IntArray
+    camera_T_body: Array | None
+    method: str
+    alternatives: tuple[Array, ...] = ()
+    reason: str = ""
+
+
+def identify_targets(
+    detections: Detections,
+    body: Body,
+    camera: Camera,
+    *,
+    predictions: Sequence[Prediction] = (),
+    model_error_px: float = 3.0,
+    search: bool = True,
+) -> IdentifiedImage:
+    """Identify the targets of a body in one image.
+
+    Codes give ids at once; with four or more of known coordinates they also give a pose, which removes misread codes
+    and predicts the uncoded and unread dots. Without enough codes a prediction (from another camera or the last pose)
+    is tried, then a search by geometry.
+
+    Parameters
+    ----------
+    predictions : expected poses, each tried; the one that explains most dots wins.
+    model_error_px : error in the image that the camera's start values may cause.
+    search : allow the search without prediction (refused where the numbering is not unique).
+    """
+    rows, ids = _coded(detections, body)
+    at = body.index(ids)
+    placed = body.known[at] if len(at) else np.zeros(0, dtype=bool)
+    if placed.sum() >= 4:
+        try:
+            fit = resect(
+                camera, ids[placed], detections.xy[rows[placed]], detections.covariance[rows[placed]], body,
+                model_error_px=model_error_px,
+            )  # fmt: skip
+        except DegenerateGeometry:
+            fit = None
+        if fit is not None and fit.inliers.sum() >= 4 and fit.chi2 < 50.0 * max(1, fit.redundancy):
+            keep = np.ones(len(rows), dtype=bool)
+            keep[np.flatnonzero(placed)[~fit.inliers]] = False
+            prediction = Prediction(fit.camera_T_body, fit.covariance, model_error_px)
+            return _extended(detections, body, camera, rows[keep], ids[keep], prediction, "codes")
+    best: IdentifiedImage | None = None
+    for prediction in predictions:
+        trial = _extended(detections, body, camera, rows, ids, prediction, "prediction")
+        if len(trial.rows) >= 4 and (best is None or len(trial.rows) > len(best.rows)):
+            best = trial
+    if best is not None:
+        return best
+    none = np.empty(0, dtype=np.int64)
+    dots = _free_dots(detections, rows)
+    candidates = np.flatnonzero(body.known & ~np.isin(body.ids, ids) & _uncoded(body))
+    reason = f"{len(ids)} coded targets read, too few for a pose"
+    if search and len(candidates) >= 4:
+        found, why = search_body(
+            camera, detections.xy[dots], detections.covariance[dots], detections.semi_axes[dots, 0], body, candidates,
+            model_error_px=model_error_px,
+        )  # fmt: skip
+        if len(found) == 1:
+            ids_found = body.ids[found[0].targets]
+            all_rows = np.concatenate([rows, dots[found[0].rows]])
+            return IdentifiedImage(
+                all_rows, np.concatenate([ids, ids_found]), found[0].camera_T_body, "search"
+            )
+        if len(found) > 1:
+            return IdentifiedImage(
+                none, none, None, "none", tuple(f.camera_T_body for f in found),
+                f"{len(found)} numberings of the dots fit equally well (the arrangement is symmetric): use coded targets "
+                "or a second camera",
+            )  # fmt: skip
+        reason = why
+    if len(rows):
+        return IdentifiedImage(rows, ids, None, "codes", (), reason if placed.sum() < 3 else "")
+    return IdentifiedImage(none, none, None, "none", (), reason)
+
+
+def _uncoded(body: Body) -> Array:
+    return np.array([code is None for code in body.codes], dtype=bool)
+
+
+def _coded(detections: Detections, body: Body) -> tuple[IntArray, IntArray]:
+    """Rows and ids of dots whose code belongs to the body; a code seen twice is no identification."""
+    ring = np.array([c == "ring12" for c in body.codes], dtype=bool)
+    marker = np.array([c is not None and c.startswith("aruco") for c in body.codes], dtype=bool)
+    code = detections.code
+    ok = np.zeros(len(code), dtype=bool)
+    ok |= (detections.kind == TargetKind.RING12) & np.isin(code, body.ids[ring])
+    ok |= (detections.kind == TargetKind.ARUCO) & np.isin(code, body.ids[marker])
+    values, counts = np.unique(code[ok], return_counts=True)
+    ok &= ~np.isin(code, values[counts > 1])
+    rows = np.flatnonzero(ok)
+    return rows, code[rows].astype(np.int64)
+
+
+def _free_dots(detections: Detections, used: IntArray) -> IntArray:
+    free = detections.kind == TargetKind.DOT
+    free |= (detections.kind == TargetKind.RING12) & (detections.code < 0)
+    free[used] = False
+    return np.flatnonzero(free)
+
+
+def _extended(
+    detections: Detections, body: Body, camera: Camera, rows: IntArray, ids: IntArray, prediction: Prediction,
+    method: str,
+) -> IdentifiedImage:  # fmt: skip
+    """Add the dots that the pose predicts, refine, and look again with the smaller uncertainty."""
+    pose, C, error = prediction.camera_T_body, prediction.covariance, prediction.error_px
+    coded, coded_ids = rows, ids
+    others = np.flatnonzero(body.known & ~np.isin(body.ids, coded_ids))
+    # a code that was seen twice or unreadable is a dot like the others
+    dots = np.setdiff1d(np.arange(len(detections.xy)), coded)
+    dots = dots[detections.kind[dots] != TargetKind.ARUCO]
+    readable = detections.code[dots]
+    for _ in range(3):
+        predicted, gate, size = _predict(camera, pose, C, body, others, error)
+        blob = detections.semi_axes[dots, 0]
+        with np.errstate(invalid="ignore"):
+            like = ~((blob[None] > 1.6 * size[:, None] + 1.0) | (blob[None] < size[:, None] / 1.6 - 1.0))
+        # a dot that carries another valid code of this body is not an uncoded target
+        other_code = np.isin(readable, body.ids) & (readable >= 0)
+        like &= ~other_code[None] | (readable[None] == body.ids[others][:, None])
+        targets, found = match_dots(predicted, gate, detections.xy[dots], like)
+        new_rows = np.concatenate([coded, dots[found]])
+        new_ids = np.concatenate([coded_ids, body.ids[others[targets]]])
+        usable = body.known[body.index(new_ids)] if len(new_ids) else np.zeros(0, dtype=bool)
+        if usable.sum() < 4:
+            return IdentifiedImage(new_rows, new_ids, pose, method)
+        at = body.index(new_ids[usable])
+        k = len(at)
+        zero = np.zeros(k, dtype=np.int64)
+        cov = detections.covariance[new_rows[usable]] + error**2 * np.eye(2)
+        fit = refine_poses(
+            pose[None], zero, zero, [camera], np.eye(4)[None], body.points[at], detections.xy[new_rows[usable]], cov,
+            radius=0.5 * body.diameters[at], normals=body.estimated_normals()[at],
+        )  # fmt: skip
+        if not np.isfinite(fit.covariance[0]).all():
+            break
+        spread = float(np.sqrt(fit.cost[0] / max(1, 2 * k - 6)))
+        pose, C = fit.reference_T_body[0], fit.covariance[0] * max(1.0, spread) ** 2
+        error = float(np.clip(error * spread, 0.1, error))
+        rows, ids = new_rows, new_ids
+    return IdentifiedImage(rows, ids, pose, method)
+
+
+def _predict(
+    camera: Camera, pose: Array, covariance: Array | None, body: Body, targets: IntArray, error_px: float
+) -> tuple[Array, Array, Array]:
+    """Image places (n, 2) of targets, search radii (n,) px and expected semi-axes (n,) px (NaN where not known)."""
+    X = body.points[targets]
+    normals = body.estimated_normals()[targets] @ pose[:3, :3].T
+    p = transform(pose, X)
+    xy, d_point, _ = project_with_jacobians(camera, effective_point(p, normals, 0.5 * body.diameters[targets]))
+    variance = np.full(len(targets), error_px**2)
+    if covariance is not None:
+        J = d_point @ np.concatenate([np.broadcast_to(pose[:3, :3], (len(X), 3, 3)), -pose[:3, :3] @ skew(X)], axis=-1)
+        S = J @ covariance @ np.swapaxes(J, -1, -2)
+        variance = variance + np.linalg.eigvalsh(0.5 * (S + np.swapaxes(S, -1, -2)))[..., -1]
+    inside = (xy > -20).all(axis=1) & (xy[:, 0] < camera.width + 20) & (xy[:, 1] < camera.height + 20)
+    if body.normals is not None:
+        facing = np.sum(normals * p, axis=1) < 0
+        inside &= facing | ~np.isfinite(normals).all(axis=1)
+    xy = np.where(inside[:, None], xy, np.nan)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        size = camera.fx * 0.5 * body.diameters[targets] / p[:, 2]
+    gate = np.where(np.isfinite(variance), _GATE * np.sqrt(np.maximum(variance, 0.01)), 0.0)
+    return xy, gate, size
+
+
+__all__ = ["Found", "IdentifiedImage", "Prediction", "identify_targets", "project"]
