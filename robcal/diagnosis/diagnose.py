@@ -12,11 +12,12 @@ from robcal.diagnosis.heldout import cross_validated, folds, noise_floor, positi
 from robcal.diagnosis.naming import rivals, signature
 from robcal.diagnosis.next_poses import separating_poses
 from robcal.diagnosis.noise import Noise, estimate_noise
-from robcal.diagnosis.recording import Accepted, Fit, Recording, fit
+from robcal.diagnosis.recording import Accepted, Fit, Recording, fit, observation_data
 from robcal.diagnosis.result import Diagnosis, Finding, Rival
 from robcal.diagnosis.selection import Selection, SelectionSettings, poses_that_carry, select
-from robcal.physics.family import numeric_sigma
-from robcal.physics.measuring import describe
+from robcal.diagnosis.swaps import find_swaps, relabelled
+from robcal.physics.family import ObservationData, numeric_sigma
+from robcal.physics.measuring import describe, swapped
 from robcal.robot.model import RobotModel
 from robcal.transforms import Array
 
@@ -36,6 +37,10 @@ def diagnose(
     """
     start = time.perf_counter()
     free, tied = tuple(free), frozenset(tied)
+    swaps = find_swaps(recording)
+    exchanged = _swap_findings(model, recording, verify, free, swaps)
+    recording = relabelled(recording, swaps)
+    verify = None if verify is None else relabelled(verify, swaps)
     noise = estimate_noise(model, recording, free)
     weighted = noise.apply(recording)
     chosen = select(model, weighted, free, tied, settings, tell)
@@ -44,8 +49,10 @@ def diagnose(
         noise = estimate_noise(model, chosen.recording, free, chosen.accepted)
     before = fit(model, chosen.recording, free)
     final = chosen.last.fit
-    findings = _findings(model, chosen, chosen.free, chosen.tied, verify, before)
+    findings = (*exchanged, *_findings(model, chosen, chosen.free, chosen.tied, verify, before))
     heldout = _heldout(chosen.recording, before, final, verify, noise)
+    if exchanged:
+        heldout = (exchanged[0].heldout[0], *heldout[1:])
     poses: tuple[dict[str, float], ...] = ()
     for finding in findings:
         if finding.rivals and not poses:
@@ -58,11 +65,39 @@ def diagnose(
         family = last.families[last.top(np.ones(len(last.families), dtype=bool))]
         pattern = f"{family.where} {family.direction or ''} with {', '.join(family.covariates) or 'no covariate'}"
     return Diagnosis(
-        p_value=chosen.p_values[0] if chosen.p_values else chosen.last.p_value, findings=findings, blunders=blunders,
+        p_value=0.0 if exchanged else chosen.p_values[0] if chosen.p_values else chosen.last.p_value, findings=findings, blunders=blunders,
         noise_estimated=float(np.sqrt(noise.factor)), joint_sigma=noise.joint_sigma, unexplained_p=last.p_value,
         unexplained_pattern=pattern, heldout=heldout, heldout_kind="verify" if verify is not None else "cross-validation",
         model=final.model, free=final.free, next_poses=poses, seconds=time.perf_counter() - start,
     )
+
+
+def _swap_findings(
+    model: RobotModel, recording: Recording, verify: Recording | None, free: tuple[str, ...],
+    swaps: tuple[tuple[int, int], ...],
+) -> tuple[Finding, ...]:
+    """Exchanged numbers are told before everything else; the gain is that of reading them right."""
+    findings = []
+    for count, (i, j) in enumerate(swaps, 1):
+        present = fit(model, relabelled(recording, swaps[:count]), free, iterations=0)
+        inspected = verify if verify is not None else recording
+        before = rms(position_errors(relabelled(inspected, swaps[: count - 1]), present))
+        after = rms(position_errors(relabelled(inspected, swaps[:count]), present))
+        family = swapped(recording_data(present, recording), i, j)
+        told = family.report(np.ones(1), {})
+        findings.append(
+            Finding(
+                family, {}, np.ones(1), np.zeros((1, 1)), told, {}, 0.0, float("inf"), (), 1.0, (), (before, after),
+                describe(family.sentence, family.where, None, told),
+            )
+        )
+    return tuple(findings)
+
+
+def recording_data(present: Fit, recording: Recording) -> ObservationData:
+    """Observation data of a recording at a fit."""
+    variables = present.kernel.variables(present.theta, present.inputs)
+    return observation_data(recording, present.frames, variables)
 
 
 def _heldout(

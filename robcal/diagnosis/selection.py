@@ -7,13 +7,14 @@ explains the same recording better than the best name and the best pair of names
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from robcal.diagnosis.analysis import Analysis, accepted_from, analyse, extend
 from robcal.diagnosis.naming import refine
 from robcal.diagnosis.recording import Accepted, Fit, Recording, fit
+from robcal.diagnosis.scan import orthonormal_basis
 from robcal.physics.family import Constants
 from robcal.robot.model import RobotModel
 from robcal.transforms import Array
@@ -37,6 +38,8 @@ class SelectionSettings:
     blunder_log_p : logarithm of the probability (all observations weighed in) below which one is a gross error.
     blunder_share : share of the observations that may be left out as gross errors.
     runs : simulations for the family-wise level.
+    least_kept : share of the linear promise that a refit must keep.
+    most_futile : families that may break their promise before a step gives up.
     """
 
     level: float = 0.01
@@ -44,6 +47,8 @@ class SelectionSettings:
     blunder_log_p: float = float(np.log(1e-3))
     blunder_share: float = 0.1
     runs: int = 400
+    least_kept: float = 0.5
+    most_futile: int = 4
 
 
 @dataclass(frozen=True)
@@ -81,13 +86,15 @@ def select(
     number = np.arange(len(recording.observations.pose))
     most_blunders = int(settings.blunder_share * len(number))
     first: Analysis | None = None
+    barred: set[tuple[str, str, str | None]] = set()
     settled = False
+    present = fit(model, recording, free)
     while True:
-        present = fit(model, recording, free, accepted)
-        look = analyse(present, recording, tied, runs=settings.runs)
+        look = analyse(present, recording, tied, runs=settings.runs, level=None if first is None else first.family_wise)
         seen = newly_visible(look, tied) if accepted else ()
         if seen:
             free, tied = (*free, *seen), tied - set(seen)
+            present = fit(model, recording, free, accepted)
             continue
         first = first or look
         if _is_blunder(look, settings) and len(left_out) < most_blunders:
@@ -96,20 +103,51 @@ def select(
             number = np.delete(number, row)
             recording = recording.without_observations(np.array([row]))
             first = None if not accepted else first
+            present = fit(model, recording, free, accepted)
             continue
-        if look.p_value > settings.level or len(accepted) >= settings.most:
-            if settled or len(accepted) < 2:
-                break
-            settled = True
-            changed, accepted, p_values = _backward(model, recording, free, tied, present, p_values, settings)
-            if not changed:
-                break
+        trial = None
+        if look.p_value <= settings.level and len(accepted) < settings.most:
+            trial = _extended(model, recording, free, look, barred, settings, tell)
+        if trial is not None:
+            present, accepted = trial, trial.accepted
+            p_values.append(look.p_value)
             continue
-        family, constants = choose(look)
-        tell(f"{look.families[family].cause} at {look.families[family].where}: p {look.p_value:.2g}")
-        accepted = (*present.accepted, accepted_from(look, family, constants))
-        p_values.append(look.p_value)
+        if settled or len(accepted) < 2:
+            break
+        settled = True
+        changed, accepted, p_values = _backward(model, recording, free, tied, present, p_values, settings)
+        if not changed:
+            break
+        present = fit(model, recording, free, accepted)
     return Selection(recording, present.accepted, tuple(p_values), first, look, free, tied, tuple(left_out))
+
+
+def _extended(
+    model: RobotModel, recording: Recording, free: tuple[str, ...], look: Analysis,
+    barred: set[tuple[str, str, str | None]], settings: SelectionSettings, tell: Callable[[str], None],
+) -> Fit | None:
+    """The fit with the best family added; families whose refit does not keep the linear promise are barred."""
+    for _ in range(settings.most_futile):
+        open_to = np.array([family.key not in barred for family in look.families])
+        choice = choose(look, open_to)
+        if choice is None:
+            return None
+        family, constants = choice
+        added = accepted_from(look, family, constants)
+        trial = fit(model, recording, free, (*look.fit.accepted, added))
+        gain = float(look.fit.residual @ look.fit.residual - trial.residual @ trial.residual)
+        if gain > settings.least_kept * promised(look, added):
+            tell(f"{added.family.cause} at {added.family.where}: p {look.p_value:.2g}")
+            return trial
+        barred.add(added.family.key)
+    return None
+
+
+def promised(look: Analysis, added: Accepted) -> float:
+    """Drop of the whitened square sum that the linear problem promises for an added cause."""
+    columns = look.at.columns(added.family, added.constants)
+    basis = orthonormal_basis(columns - look.basis @ (look.basis.T @ columns))
+    return float(np.sum((basis.T @ look.residual) ** 2))
 
 
 def newly_visible(look: Analysis, tied: frozenset[str]) -> tuple[str, ...]:
@@ -137,10 +175,11 @@ def _is_blunder(look: Analysis, settings: SelectionSettings) -> bool:
     return bool(significant and look.suspect.log_evidence > np.max(look.ranked.log_weight))
 
 
-def choose(look: Analysis) -> tuple[int, Constants]:
+def choose(look: Analysis, open_to: Array | None = None) -> tuple[int, Constants] | None:
     """The family to be added: best name or, where that explains less, the best empirical term."""
     options: list[tuple[float, int, Constants]] = []
-    for chosen in (look.named, ~look.named):
+    allowed = np.ones(len(look.families), dtype=bool) if open_to is None else open_to
+    for chosen in (look.named & allowed, ~look.named & allowed):
         if not np.any(chosen & np.isfinite(look.ranked.log_weight)):
             continue
         family = look.top(chosen)
@@ -149,6 +188,8 @@ def choose(look: Analysis) -> tuple[int, Constants]:
         after = extend(look, look.at.columns(look.families[family], constants))
         others = float(np.max(np.where(after.named, after.ranked.log_weight, -np.inf), initial=-np.inf))
         options.append((weight + max(others, 0.0), family, constants))
+    if not options:
+        return None
     _, family, constants = max(options, key=lambda option: option[0])
     return family, constants
 
@@ -170,7 +211,11 @@ def _backward(
             del probabilities[k]
             changed = True
             continue
-        family, constants = choose(look)
+        choice = choose(look)
+        if choice is None:
+            k += 1
+            continue
+        family, constants = choice
         if look.families[family].key != accepted[k].family.key and _gain(look, family, accepted[k]) > 3.0:
             accepted = list(look.fit.accepted)
             accepted.insert(k, accepted_from(look, family, constants))
@@ -184,16 +229,6 @@ def _gain(look: Analysis, family: int, present: Accepted) -> float:
     standing = [f for f, other in enumerate(look.families) if other.key == present.family.key]
     weight = max((float(look.ranked.log_weight[f]) for f in standing), default=-np.inf)
     return float(look.ranked.log_weight[family]) - weight
-
-
-def without(selection_fit: Fit, index: int) -> tuple[Accepted, ...]:
-    """All accepted causes but one."""
-    return tuple(item for k, item in enumerate(selection_fit.accepted) if k != index)
-
-
-def zeroed(item: Accepted) -> Accepted:
-    """The same cause with amplitudes zero (start of a refit)."""
-    return replace(item, values=np.zeros_like(item.values))
 
 
 def poses_that_carry(signature: Array, row_pose: Array, names: tuple[str, ...], most: int = 20) -> tuple[str, ...]:

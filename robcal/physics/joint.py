@@ -225,28 +225,30 @@ def _coupling(joint: Joint, joints: list[Joint]) -> Iterator[Family]:
 
 
 def _counterbalance(site: RobotSite, joints: list[Joint]) -> Iterator[Family]:
-    # A balancing cylinder or spring hangs at the shoulder: the joint with the largest torque.
-    loaded = [joint for joint in joints if not joint.prismatic and site.varies(f"torque{joint.number}", 50.0)]
-    if not loaded:
-        return
-    joint = max(loaded, key=lambda j: float(np.max(np.abs(site.variables[f"torque{j.number}"]))))
-    elastic = float(site.model.parameters.get(f"{joint.frame}.elastic_{joint.own_angle}", 0.0))
-    if elastic <= 1e-8:
-        return
+    """Shows through the joint's own compliance only, so it equals an eccentricity of the first order."""
+    loaded = []
+    for joint in joints:
+        elastic = float(site.model.parameters.get(f"{joint.frame}.elastic_{joint.own_angle}", 0.0))
+        if not joint.prismatic and elastic > 1e-8:
+            loaded.append((float(np.max(np.abs(site.variables[f"torque{joint.number}"]))), elastic, joint))
+    loaded.sort(key=lambda item: -item[0])
+    for rank, (largest, elastic, joint) in enumerate(loaded):
 
-    def report(v: Array, c: Constants) -> dict[str, object]:
-        amplitude, phase = _amplitude_phase(v, 1.0)
-        return {"torque_Nm": amplitude, "phase_deg": phase}
+        def report(v: Array, c: Constants) -> dict[str, object]:
+            amplitude, phase = _amplitude_phase(v, 1.0)
+            return {"torque_Nm": amplitude, "phase_deg": phase}
 
-    yield Family(
-        "counterbalance", "robot", joint.where, LETTER[joint.own_angle], ("cosine", "sine"), (300.0, 300.0), report,
-        "A balancing torque of {torque_Nm:.0f} N m acts on {where} that the model does not know",
-        bases=lambda c: tuple(
-            replace(b, expression=f"{elastic!r}*{b.expression}")
-            for b in _harmonic(joint.number, joint.frame, "q", 1.0)
-        ),
-        covariates=(f"q{joint.number}",),
-    )
+        def bases(c: Constants, joint: Joint = joint, elastic: float = elastic) -> tuple[Basis, ...]:
+            waves = _harmonic(joint.number, joint.frame, "q", 1.0)
+            return tuple(replace(wave, expression=f"{elastic!r}*{wave.expression}") for wave in waves)
+
+        size = max(0.2 * largest, 1.0)
+        yield Family(
+            "counterbalance", "robot", joint.where, LETTER[joint.own_angle], ("cosine", "sine"), (size, size), report,
+            "A balancing torque of {torque_Nm:.0f} N m acts on {where} that the model does not know",
+            # balancing cylinders and springs hang at the joint with the largest torque
+            bases=bases, covariates=(f"q{joint.number}",), weight=0.7 if rank == 0 else 0.3 / (len(loaded) - 1),
+        )
 
 
 def _zero_drift(site: RobotSite, joint: Joint) -> Iterator[Family]:

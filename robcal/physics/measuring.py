@@ -7,7 +7,7 @@ twist of the frame (translation first) for frames, metres along the wire for dis
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -18,6 +18,7 @@ from robcal.transforms import Array
 STEEL_WIRE_N = 5.0
 """Tension that a draw-wire encoder typically keeps up (makers' data sheets: 2 to 10 N); sag scales with its inverse."""
 GRAVITY = 9.80665
+Course = Callable[[ObservationData], Array]
 
 
 def measuring_families(data: ObservationData, ids: tuple[int, ...], body: str) -> Iterator[Family]:
@@ -32,25 +33,31 @@ def measuring_families(data: ObservationData, ids: tuple[int, ...], body: str) -
         yield from _sensor(data, body)
 
 
-def _times(data: ObservationData) -> Iterator[tuple[str, Array, str]]:
-    """Covariates of slow change: name, values per pose from the first one on, unit in the contract."""
-    index = data.variables["index"]
-    first = int(np.argmin(index))
+def _temperatures(data: ObservationData) -> Iterator[tuple[str, Callable[[ObservationData], Array]]]:
+    """Recorded temperatures that vary, as their change since the first pose, per observation (m, 1, 1)."""
+    first = int(np.argmin(data.variables["index"]))
     for name, values in data.variables.items():
         if name.startswith("temp_") and np.ptp(values) > 0.2:
-            yield name, values - values[first], "K"
+            reference = float(values[first])
+
+            def change(d: ObservationData, name: str = name, reference: float = reference) -> Array:
+                return (d.variables[name] - reference)[d.pose][:, None, None]
+
+            yield name, change
 
 
-def _hours(data: ObservationData) -> tuple[Array, float] | None:
+def _clock(data: ObservationData) -> tuple[float, Callable[[ObservationData, float], Array]] | None:
+    """Duration in hours and the course of a warming up, duration * (1 - exp(-t/tau)) / (1 - exp(-duration/tau))."""
     seconds = data.variables.get("time_s")
     if seconds is None or np.ptp(seconds) <= 0:
         return None
-    hours = (seconds - np.min(seconds)) / 3600.0
-    return hours, float(np.max(hours))
+    start, duration = float(np.min(seconds)), float(np.ptp(seconds)) / 3600.0
 
+    def course(d: ObservationData, tau: float) -> Array:
+        hours = (d.variables["time_s"][d.pose] - start) / 3600.0
+        return (duration * np.expm1(-hours / tau) / np.expm1(-duration / tau))[:, None, None]
 
-def _warming(hours: Array, duration: float, tau: float) -> Array:
-    return duration * np.expm1(-hours / tau) / np.expm1(-duration / tau)
+    return duration, course
 
 
 def _world(data: ObservationData, shift: Array, turn: Array | None = None) -> Array:
@@ -76,37 +83,35 @@ def _station(data: ObservationData) -> Iterator[Family]:
     )
     if data.kind == "points" and len(np.unique(data.target)) >= 2:
         yield scale  # with frames alone the lengths of the robot absorb it
-    for name, values, _ in _times(data):
+    for name, change in _temperatures(data):
 
-        def drift(d: ObservationData, c: Constants, v: Array = values) -> Array:
-            return _world(d, _positions(d)[:, :, None] * v[d.pose][:, None, None])
+        def drift(d: ObservationData, c: Constants, change: Course = change) -> Array:
+            return _world(d, _positions(d)[:, :, None] * change(d))
 
         yield replace(
             scale, cause="scale_drift", priors=(2e-5,), report=lambda v, c: {"ppm_per_K": float(v[0]) * 1e6},
             sentence="The scale of the station drifts by {ppm_per_K:.1f} ppm per kelvin", displace=drift,
             covariates=(name,), weight=0.5,
         )
-    clock = _hours(data)
+    clock = _clock(data)
     if clock is not None:
-        hours, duration = clock
+        duration, course = clock
         yield replace(
             scale, cause="scale_drift", priors=(1e-4 / duration,), covariates=("time_s",), weight=0.5,
             report=lambda v, c: {"ppm_per_h": float(v[0]) * 1e6, "tau_h": c["tau_h"]},
             sentence="The scale of the station drifts by {ppm_per_h:.1f} ppm per hour",
             grid=tuple({"tau_h": share * duration} for share in (0.1, 0.25, 0.6, 3.0)),
             continuous={"tau_h": (0.02 * duration, 10.0 * duration)},
-            displace=lambda d, c: _world(
-                d, _positions(d)[:, :, None] * _warming(hours, duration, c["tau_h"])[d.pose][:, None, None]
-            ),
+            displace=lambda d, c: _world(d, _positions(d)[:, :, None] * course(d, c["tau_h"])),
         )
     order = np.sort(data.variables["index"])
-    centre = p.mean(axis=0)
 
     def moved(d: ObservationData, c: Constants) -> Array:
-        after = (d.variables["index"][d.pose] > c["pose"] - 0.5).astype(float)[:, None, None]
+        # the station moved by (shift, turn) about its origin, so everything it measures moves the other way
+        after = -(d.variables["index"][d.pose] > c["pose"] - 0.5).astype(float)[:, None, None]
         arm = _positions(d)
         turn = np.broadcast_to(np.eye(3), (len(arm), 3, 3))
-        shift = np.concatenate([turn, _cross_columns(arm - centre)], axis=2)
+        shift = np.concatenate([turn, _cross_columns(arm)], axis=2)
         return _world(d, shift * after, np.concatenate([np.zeros_like(turn), turn], axis=2) * after)
 
     yield Family(
@@ -140,10 +145,12 @@ def _body(data: ObservationData, ids: tuple[int, ...], body: str) -> Iterator[Fa
             "Target {where} sits at another place than its file says, by {shift_mm} mm",
             displace=shifted, weight=1.0 / len(present),
         )
-    for name, values, _ in _times(data):
+    pairs = [(i, j) for k, i in enumerate(present) for j in present[k + 1:]]
+    yield from (replace(swapped(data, i, j), weight=1.0 / len(pairs)) for i, j in pairs)
+    for name, change in _temperatures(data):
 
-        def grown(d: ObservationData, c: Constants, v: Array = values) -> Array:
-            return (np.einsum("mij,mj->mi", d.world_T_tool[:, :3, :3], d.p_tool) * v[d.pose][:, None])[:, :, None]
+        def grown(d: ObservationData, c: Constants, change: Course = change) -> Array:
+            return np.einsum("mij,mj->mi", d.world_T_tool[:, :3, :3], d.p_tool)[:, :, None] * change(d)
 
         yield Family(
             "body_thermal_growth", "body", body, None, ("growth",), (1.5e-5,),
@@ -151,6 +158,21 @@ def _body(data: ObservationData, ids: tuple[int, ...], body: str) -> Iterator[Fa
             "The measuring body {where} grows by {um_per_m_K:.1f} um per metre and kelvin",
             displace=grown, covariates=(name,),
         )
+
+
+def swapped(data: ObservationData, i: int, j: int) -> Family:
+    """Targets i and j carry each other's number: one column with the amplitude one."""
+    there = {t: data.p_tool[np.flatnonzero(data.target == t)[0]] for t in (i, j)}
+
+    def displace(d: ObservationData, c: Constants) -> Array:
+        step = np.where((d.target == i)[:, None], there[j] - there[i], 0.0)
+        step = step + np.where((d.target == j)[:, None], there[i] - there[j], 0.0)
+        return np.einsum("mij,mj->mi", d.world_T_tool[:, :3, :3], step)[:, :, None]
+
+    return Family(
+        "target_swapped", "body", str(i), None, ("share",), (1.0,), lambda v, c: {"with": j},
+        f"Targets {i} and {j} carry each other's number", displace=displace,
+    )
 
 
 def _wire() -> Iterator[Family]:
@@ -197,10 +219,10 @@ def _sensor(data: ObservationData, body: str) -> Iterator[Family]:
         "The sensor's axes are turned by {deg} deg",
         displace=lambda d, c: d.world_T_tool[:, :3, :3] @ _cross_columns(_required(d.p_sensor)),
     )
-    for name, values, _ in _times(data):
+    for name, change in _temperatures(data):
 
-        def grown(d: ObservationData, c: Constants, v: Array = values) -> Array:
-            return -(d.p_world * v[d.pose][:, None])[:, :, None]
+        def grown(d: ObservationData, c: Constants, change: Course = change) -> Array:
+            return -d.p_world[:, :, None] * change(d)
 
         yield Family(
             "sphere_growth", "sensor", body, None, ("growth",), (1e-5,), lambda v, c: {"um_per_m_K": float(v[0]) * 1e6},
