@@ -8,12 +8,19 @@ from scipy import sparse
 
 from robcal.transforms import Array
 
+_SMALL = 20_000
+
 
 def sum_by(group: NDArray[np.int64], values: Array, n: int) -> Array:
     """Sums of ``values`` (m, ...) over equal numbers in ``group`` (m,), shape (n, ...)."""
     m = len(group)
     if m == 0:
         return np.zeros((n, *values.shape[1:]))
+    if n == 1:
+        return values.sum(axis=0, keepdims=True)
+    if n * m <= _SMALL:  # a dense matrix costs less than setting up a sparse one
+        chooser = (group == np.arange(n)[:, None]).astype(float)
+        return (chooser @ values.reshape(m, -1)).reshape(n, *values.shape[1:])
     adder = sparse.csr_matrix((np.ones(m), (group, np.arange(m))), shape=(n, m))
     return np.asarray(adder @ values.reshape(m, -1)).reshape(n, *values.shape[1:])
 

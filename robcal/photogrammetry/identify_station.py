@@ -1,4 +1,4 @@
-"""Identification over a whole station: images help one another through the other cameras and the last pose."""
+"""Identification over a whole station: images help one another through the other cameras."""
 
 from __future__ import annotations
 
@@ -53,13 +53,9 @@ def identify_station(
     loose = {n: model_error_px if cameras.get(n) is not None else 4.0 * model_error_px for n in sizes}
     found: dict[tuple[str, int], IdentifiedImage] = {}
     for name in sizes:
-        last: list[Prediction] = []
         for pose in sorted(detections[name]):
-            image = identify_targets(
-                detections[name][pose], body, start[name], predictions=last, model_error_px=loose[name]
-            )
-            found[name, pose] = image
-            last = []  # the robot may go anywhere between two poses: the last pose is no prediction here
+            # the robot may go anywhere between two poses: the last pose is no prediction
+            found[name, pose] = identify_targets(detections[name][pose], body, start[name], model_error_px=loose[name])
     orientation = _orient(found, detections, body, cameras, sizes)
     if orientation is not None:
         _second_round(found, detections, body, orientation)
@@ -112,6 +108,8 @@ def _second_round(
     ratio = max(1.0, orientation.rms_px)
     for (name, pose), before in list(found.items()):
         if name not in orientation.names or pose not in at:
+            continue
+        if len(before.rows) >= body.known.sum():
             continue
         c = orientation.names.index(name)
         e = int(orientation.exterior_of(c, [pose])[0])

@@ -158,6 +158,9 @@ def _extended(
     dots = np.setdiff1d(np.arange(len(detections.xy)), coded)
     dots = dots[detections.kind[dots] != TargetKind.ARUCO]
     readable = detections.code[dots]
+    if len(others) == 0 and len(rows):
+        return IdentifiedImage(rows, ids, pose, method)
+    before: tuple[int, ...] | None = None
     for _ in range(3):
         predicted, gate, size = _predict(camera, pose, C, body, others, error)
         blob = detections.semi_axes[dots, 0]
@@ -169,6 +172,10 @@ def _extended(
         targets, found = match_dots(predicted, gate, detections.xy[dots], like)
         new_rows = np.concatenate([coded, dots[found]])
         new_ids = np.concatenate([coded_ids, body.ids[others[targets]]])
+        now = (*new_rows.tolist(), *new_ids.tolist())
+        if now == before:
+            break
+        before = now
         usable = body.known[body.index(new_ids)] if len(new_ids) else np.zeros(0, dtype=bool)
         if usable.sum() < 4:
             return IdentifiedImage(new_rows, new_ids, pose, method)
