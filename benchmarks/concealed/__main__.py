@@ -24,12 +24,13 @@ from typing import Any
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):  # before numpy is loaded: a run uses one core
     os.environ.setdefault(_name, "1")
 
-from benchmarks.concealed.adapter import ADAPTERS  # noqa: E402
+from benchmarks.concealed.adapter import ADAPTERS, Answer  # noqa: E402
 from benchmarks.concealed.scenarios import BATTERIES, Scenario  # noqa: E402
 from benchmarks.concealed.scoring import score  # noqa: E402
 from benchmarks.concealed.tables import report  # noqa: E402
 from fixtures.campaigns import write_campaign, write_poses  # noqa: E402
-from fixtures.recordings import record  # noqa: E402
+from fixtures.plan import Truth  # noqa: E402
+from fixtures.recordings import driven_further, record  # noqa: E402
 
 
 def run_one(scenario: Scenario, adapter: str) -> dict[str, Any]:
@@ -50,7 +51,10 @@ def run_one(scenario: Scenario, adapter: str) -> dict[str, Any]:
                 write_poses(kept.poses, truth, tables[name])
         try:
             answer = ADAPTERS[adapter](campaign, tables)
-            return {**head, **score(scenario, recording, truth, answer)}
+            result = {**head, **score(scenario, recording, truth, answer)}
+            if scenario.follow and answer.diagnosis.get("next_poses"):
+                result |= _followed(truth, answer, adapter, root)
+            return result
         except Exception as error:
             return {
                 **head,
@@ -58,6 +62,16 @@ def run_one(scenario: Scenario, adapter: str) -> dict[str, Any]:
                 "traceback": traceback.format_exc()[-1500:],
                 "truth": [e.as_dict() for e in truth.effects],
             }
+
+
+def _followed(truth: Truth, answer: Answer, adapter: str, root: Path) -> dict[str, Any]:
+    """Drive the poses that the tool proposes, ask again: is the first name the true one now?"""
+    recording, _ = record(truth.plan, driven_further(truth, answer.diagnosis["next_poses"]))
+    second = ADAPTERS[adapter](write_campaign(recording, root / "again" / "campaign"), {})
+    first = second.causes[0] if second.causes else {"cause": None, "where": None}
+    effect = truth.effects[0]
+    right = first["cause"] == effect.cause and first["where"] == effect.where
+    return {"followed_right": right, "followed": [c["cause"] for c in second.causes]}
 
 
 def _read(path: Path) -> list[dict[str, Any]]:

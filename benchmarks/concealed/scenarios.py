@@ -26,6 +26,7 @@ class Scenario:
 
     ``build`` makes its plan when it is needed (None where the effect cannot show in it). ``snr`` is what is aimed at
     (None for nulls and mixtures). ``together``: causes of which the tool has to say that it cannot tell them apart.
+    ``follow``: the poses that the tool proposes are driven, and it is asked again.
     """
 
     battery: str
@@ -35,6 +36,7 @@ class Scenario:
     snr: float | None
     build: Callable[[], Plan | None]
     together: tuple[str, ...] = ()
+    follow: bool = False
 
     @property
     def key(self) -> str:
@@ -145,7 +147,7 @@ def inseparable(count: int, seed: int, level: str) -> Iterator[Scenario]:
         yield Scenario(
             "inseparable", "axis 2 on a short range", level, own, 10.0,
             partial(_sized, partial(plan, axis_ranges={"axis2": 0.25}), ratio, 10.0),
-            ("transmission_ratio", "joint_eccentricity"),
+            ("transmission_ratio", "joint_eccentricity"), follow=True,
         )  # fmt: skip
         yield Scenario(
             "inseparable", "eccentricity or balancing torque", level, own, 12.0,

@@ -129,18 +129,22 @@ def mixtures(records: Sequence[Record]) -> str:
 
 
 def inseparable(records: Sequence[Record]) -> str:
-    """Pairs whose signatures coincide."""
-    rows = [
-        [
-            name,
-            str(len(g)),
-            _share(r["mismatch"] for r in g),
-            _share(r.get("told_together") for r in g if r["mismatch"]),
-            _share(r.get("name_right") for r in g if r["mismatch"]),
-        ]
-        for name, g in _groups(records, lambda r: r["label"])
-    ]
-    return _table(["pair", "runs", "detected", "says so", "name in the class"], rows)
+    """Pairs whose signatures coincide; with the proposed poses: the true name itself, not one of its class."""
+    rows = []
+    for name, g in _groups(records, lambda r: r["label"]):
+        found = [r for r in g if r["mismatch"]]
+        rows.append(
+            [
+                name,
+                str(len(g)),
+                _share(r["mismatch"] for r in g),
+                _share(r.get("told_together") for r in found),
+                _share(r.get("name_right") for r in found),
+                _share(r.get("followed_right") for r in found),
+            ]
+        )
+    header = ["pair", "runs", "detected", "says so", "name in the class", "true name with the proposed poses"]
+    return _table(header, rows)
 
 
 def decoys(records: Sequence[Record]) -> str:
