@@ -13,7 +13,7 @@ from robcal.imaging.detections import CodeState, Detections, Reason, RejectionLo
 from robcal.imaging.dot_fitting import FittedDots, blur_without_pixel, fit_dots, refit_coded
 from robcal.imaging.noise import NoiseModel, estimate_noise
 from robcal.imaging.ring_code import RingReadings, read_rings
-from robcal.imaging.segmentation import Candidates, find_candidates
+from robcal.imaging.segmentation import Candidates, find_candidates, step_all_around
 from robcal.imaging.settings import DetectionSettings
 
 Array = NDArray[np.float64]
@@ -50,6 +50,10 @@ def detect_targets(image: NDArray, settings: DetectionSettings = _DEFAULT) -> De
     bright, bright_noise = _bright(image, noise, settings)
     saturation = _saturation(bright, settings)
     candidates = find_candidates(bright, bright_noise, settings, log)
+    around = step_all_around(bright, candidates)
+    for row in np.flatnonzero(~around):
+        log.add(*candidates.xy[row], candidates.semi_axes[row, 0], Reason.SHAPE)
+    candidates = candidates.take(around)
     late = _may_be_ring_parts(candidates) if settings.ring12 else np.zeros(len(candidates), bool)
     dots, bright_noise, _ = fit_dots(bright, candidates.take(~late), bright_noise, saturation, settings.max_misfit)
     log.count(Reason.SHAPE, int((~late).sum()) - len(dots))
@@ -65,7 +69,9 @@ def detect_targets(image: NDArray, settings: DetectionSettings = _DEFAULT) -> De
     if settings.aruco is not None:
         markers = find_markers(image, settings.aruco, noise)
         columns = {name: np.concatenate([columns[name], markers[name]]) for name in columns}
-    found = replace(noise, gain=abs(bright_noise.gain))
+    found = replace(
+        noise, gain=abs(bright_noise.gain), variance=bright_noise.variance, correlation=bright_noise.correlation
+    )
     return _detections(image, columns, found, log, "" if len(columns["xy"]) else _no_target(log))
 
 

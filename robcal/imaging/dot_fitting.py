@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from robcal.imaging.edge_model import axes_from_matrix, edge_distance, matrix_from_axes
+from robcal.imaging.edge_model import axes_from_matrix, matrix_from_axes, signed_distance
 from robcal.imaging.ellipse_fit import EllipseFits, evaluate, free_shading, iterate, outliers, start
 from robcal.imaging.noise import NoiseModel, correlation_factor, with_gain
 from robcal.imaging.ring_code import RingReadings, ring_glare
@@ -94,11 +94,11 @@ def fit_dots(
     max_misfit : fits with three times this misfit (by contrast) after the first round are given up.
     """
     groups, fits = _first_round(image, candidates, noise, saturation, max_misfit)
-    noise = _noise_around(groups, fits, noise)
-    noise = _noise_inside(groups, fits, noise)
+    clean = [_clean(window, fit, max_misfit) for window, fit in zip(groups, fits, strict=True)]
+    noise = _noise_inside(groups, fits, clean, _noise_around(groups, fits, clean, noise))
     fits = [iterate(fit, window, noise, 2, tolerance=0.05) for window, fit in zip(groups, fits, strict=True)]
     shading, prior = _shading(groups, fits)
-    noise = replace(noise, correlation=_correlation(groups, fits))
+    noise = replace(noise, correlation=_correlation(groups, fits, clean))
     results = []
     for window, fit in zip(groups, fits, strict=True):
         results.append(_finish(fit, window, noise, shading[window.index], candidates))
@@ -143,7 +143,7 @@ def _first_round(
     groups = gather_windows(image, candidates, saturation)
     kept_groups, kept_fits = [], []
     for window in groups:
-        fit = iterate(_start(candidates, window), window, noise, 7, tolerance=0.2)
+        fit = iterate(_start(candidates, window), window, noise, 5, tolerance=0.2)
         used = np.maximum((fit.weight > 0).sum(axis=1), 1)
         mean_square = np.where(fit.weight > 0, fit.residual**2, 0.0).sum(axis=1) / used
         expected = np.where(fit.weight > 0, 1.0 / np.maximum(fit.weight, 1e-30), 0.0).sum(axis=1) / used
@@ -152,18 +152,26 @@ def _first_round(
         if near.size:
             window, fit = window.take(near), fit.take(near)
             kept_groups.append(window)
-            kept_fits.append(iterate(fit, window, noise, 6, tolerance=0.2))
+            kept_fits.append(iterate(fit, window, noise, 8, tolerance=0.2))
     return kept_groups, kept_fits
 
 
-def _noise_around(groups: list[Windows], fits: list[EllipseFits], noise: NoiseModel) -> NoiseModel:
+def _clean(window: Windows, fit: EllipseFits, max_misfit: float) -> NDArray[np.bool_]:
+    """(n,) fits that are dots without doubt: only these tell about the image's noise."""
+    used = np.maximum((fit.weight > 0).sum(axis=1), 1)
+    rms = np.sqrt(np.where(fit.weight > 0, fit.residual**2, 0.0).sum(axis=1) / used)
+    return fit.converged & (rms < max_misfit * np.abs(fit.parameters[:, 9])) & (used > 24)
+
+
+def _noise_around(
+    groups: list[Windows], fits: list[EllipseFits], clean: list[NDArray[np.bool_]], noise: NoiseModel
+) -> NoiseModel:
     """The noise model with the read noise seen around the dots, where it is more than the quietest parts show."""
     found = []
-    for window, fit in zip(groups, fits, strict=True):
-        distance = edge_distance(fit.parameters, window.x, window.y)[0]
-        background = (fit.weight > 0) & (distance > 2.4 * np.exp(fit.parameters[:, 5, None]))
+    for window, fit, good in zip(groups, fits, clean, strict=True):
+        background = (fit.weight > 0) & _is_background(window, fit)
         count = background.sum(axis=1)
-        use = fit.converged & (count >= 20)
+        use = good & (count >= 20)
         squares = np.where(background, fit.residual**2, 0.0).sum(axis=1)
         # three parameters of the background plane, two more for what the edge takes
         found.append((squares[use] / (count[use] - 5.0)) - noise.gain * (fit.parameters[use, 6] - noise.level))
@@ -174,11 +182,18 @@ def _noise_around(groups: list[Windows], fits: list[EllipseFits], noise: NoiseMo
     return replace(noise, variance=typical) if typical > 1.3 * noise.variance else noise
 
 
-def _noise_inside(groups: list[Windows], fits: list[EllipseFits], noise: NoiseModel) -> NoiseModel:
+def _is_background(window: Windows, fit: EllipseFits) -> NDArray[np.bool_]:
+    distance = signed_distance(fit.parameters, window.x, window.y)
+    return distance > 2.4 * np.exp(fit.parameters[:, 5, None])
+
+
+def _noise_inside(
+    groups: list[Windows], fits: list[EllipseFits], clean: list[NDArray[np.bool_]], noise: NoiseModel
+) -> NoiseModel:
     """The noise model with the gain seen on the bright pixels of the dots, by residuals and their redundancy."""
     grey, variance, weights = [], [], []
-    for window, fit in zip(groups, fits, strict=True):
-        use = np.flatnonzero(fit.converged)
+    for window, fit, good in zip(groups, fits, clean, strict=True):
+        use = np.flatnonzero(good)
         if use.size == 0:
             continue
         part, chosen = window.take(use), fit.take(use)
@@ -200,20 +215,28 @@ def _noise_inside(groups: list[Windows], fits: list[EllipseFits], noise: NoiseMo
     return with_gain(noise, np.concatenate(grey), np.concatenate(variance), np.concatenate(weights))
 
 
-def _correlation(groups: list[Windows], fits: list[EllipseFits]) -> float:
+def _correlation(groups: list[Windows], fits: list[EllipseFits], clean: list[NDArray[np.bool_]]) -> float:
     """Noise correlation from the residuals of neighbouring background pixels (rows are in reading order)."""
-    products, squares, count = 0.0, 0.0, 0
-    for window, fit in zip(groups, fits, strict=True):
-        background = (fit.weight > 0) & ~window.inside & fit.converged[:, None]
-        background &= edge_distance(fit.parameters, window.x, window.y)[0] > 2.4 * np.exp(fit.parameters[:, 5, None])
+    products, squares, count = [], [], 0
+    for window, fit, good in zip(groups, fits, clean, strict=True):
+        background = (fit.weight > 0) & good[:, None] & _is_background(window, fit)
         pair = background[:, :-1] & background[:, 1:]
         pair &= (window.x[:, 1:] - window.x[:, :-1] == 1) & (window.y[:, 1:] == window.y[:, :-1])
-        normalised = np.where(fit.weight > 0, fit.residual * np.sqrt(fit.weight), 0.0)
-        normalised = np.clip(normalised, -4.0, 4.0)
-        products += float((normalised[:, :-1] * normalised[:, 1:])[pair].sum())
-        squares += float(0.5 * (normalised[:, :-1] ** 2 + normalised[:, 1:] ** 2)[pair].sum())
+        normalised = np.clip(fit.residual * np.sqrt(fit.weight), -4.0, 4.0)
+        left, right = normalised[:, :-1], normalised[:, 1:]
+        products.append(np.where(pair, left * right, 0.0).sum(axis=1)[good])
+        squares.append(np.where(pair, 0.5 * (left**2 + right**2), 0.0).sum(axis=1)[good])
         count += int(pair.sum())
-    return correlation_factor(products / squares) if count >= 300 and squares > 0 else 1.0
+    if count < 300:
+        return 1.0
+    product, square = np.concatenate(products), np.concatenate(squares)
+    # the middle of the dots: single ones have texture around them
+    use = square > 0
+    lag_one = product[use] / square[use]
+    order = np.argsort(lag_one)
+    weight = np.cumsum(square[use][order])
+    kept = order[(weight > 0.25 * weight[-1]) & (weight <= 0.75 * weight[-1])] if len(order) >= 8 else order
+    return correlation_factor(float(product[use][kept].sum() / square[use][kept].sum()))
 
 
 def _shading(groups: list[Windows], fits: list[EllipseFits]) -> tuple[Array, float]:
@@ -245,8 +268,10 @@ def _finish(fit: EllipseFits, window: Windows, noise: NoiseModel, shading: Array
     prior_blur = np.log(np.maximum(candidates.blur[window.index], 0.3))
     fit = iterate(replace(fit, shading_sigma=shading), window, noise, 12, tolerance=0.05, prior_blur=prior_blur)
     dropped = outliers(fit, window)
-    if dropped.any():
-        fit = iterate(fit, window, noise, 6, tolerance=0.05, dropped=dropped, prior_blur=prior_blur)
+    dirty = np.flatnonzero(dropped.any(axis=1))
+    if dirty.size:
+        again = iterate(fit.take(dirty), window.take(dirty), noise, 6, 0.05, dropped[dirty], prior_blur[dirty])
+        fit = fit.replaced(dirty, again)
     semi_axes, _ = axes_from_matrix(fit.parameters[:, 2:5])
     ratio = semi_axes[:, 1] / np.exp(fit.parameters[:, 5])
     tiny = (ratio < _SPOT_RATIO_ROUND) | ((ratio < _SPOT_RATIO) & (semi_axes[:, 1] < 0.85 * semi_axes[:, 0]))
@@ -265,13 +290,9 @@ def _as_spots(
     second = np.sqrt(np.exp(2.0 * parameters[:, 5, None]) + semi_axes**2 / 4.0)
     parameters[:, 2:5] = matrix_from_axes(second, angle)
     spots = replace(old, parameters=parameters, is_spot=np.ones(len(rows), bool))
-    spots = iterate(spots, chosen, noise, 15, 0.05, dropped[rows], prior_blur[rows])
-    columns = {}
-    for name in EllipseFits.__dataclass_fields__:
-        column = getattr(fit, name).copy()
-        column[rows] = getattr(spots, name)
-        columns[name] = column
-    return EllipseFits(**columns)
+    for steps in (4, 10):
+        spots = iterate(spots, chosen, noise, steps, 0.05, dropped[rows], prior_blur[rows])
+    return fit.replaced(rows, spots)
 
 
 def _columns(fit: EllipseFits, window: Windows, noise: NoiseModel) -> dict:

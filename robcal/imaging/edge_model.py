@@ -25,8 +25,27 @@ SHAPE_PARAMETERS = 6  # cx, cy, B11, B12, B22, ln s
 _SQRT_2PI = float(np.sqrt(2.0 * np.pi))
 
 
+def _geometry(shape: Array, x: Array, y: Array) -> tuple[Array, ...]:
+    """Common parts: dx, dy, u, v, q, w and k of the module's formulas."""
+    b11, b12, b22 = (shape[:, k, None] for k in (2, 3, 4))
+    dx, dy = x - shape[:, 0, None], y - shape[:, 1, None]
+    u1, u2 = b11 * dx + b12 * dy, b12 * dx + b22 * dy
+    v1, v2 = b11 * u1 + b12 * u2, b12 * u1 + b22 * u2
+    q = u1 * u1 + u2 * u2
+    w = np.sqrt(v1 * v1 + v2 * v2)
+    np.maximum(w, 1e-9, out=w)
+    return dx, dy, u1, u2, v1, v2, q, w, b11 * b22 - b12 * b12
+
+
+def signed_distance(shape: Array, x: Array, y: Array) -> Array:
+    """First-order signed distance (n, p) of pixels (n, p) to the edge of ellipses (n, >= 5), px, negative inside."""
+    _, _, _, _, _, _, q, w, k = _geometry(shape, x, y)
+    inside = (w - np.sqrt(np.maximum(w * w + k * (1.0 - q), 0.0))) / k
+    return np.where(q < 1.0, inside, (q - np.sqrt(q)) / w)
+
+
 def edge_distance(shape: Array, x: Array, y: Array) -> tuple[Array, Array]:
-    """First-order signed distance of pixels to the edge.
+    """Signed distance as above, and its derivative.
 
     Parameters
     ----------
@@ -37,29 +56,24 @@ def edge_distance(shape: Array, x: Array, y: Array) -> tuple[Array, Array]:
     d : (n, p) px, negative inside. derivative : (n, p, 5) by cx, cy, B11, B12, B22.
     """
     b11, b12, b22 = (shape[:, k, None] for k in (2, 3, 4))
-    dx, dy = x - shape[:, 0, None], y - shape[:, 1, None]
-    u1, u2 = b11 * dx + b12 * dy, b12 * dx + b22 * dy
-    v1, v2 = b11 * u1 + b12 * u2, b12 * u1 + b22 * u2
+    dx, dy, u1, u2, v1, v2, q, w, k = _geometry(shape, x, y)
     z1, z2 = b11 * v1 + b12 * v2, b12 * v1 + b22 * v2
-    q = u1 * u1 + u2 * u2
-    w = np.maximum(np.sqrt(v1 * v1 + v2 * v2), 1e-9)
-    k = b11 * b22 - b12 * b12
     inside = q < 1.0
-    root = np.sqrt(np.where(inside, np.maximum(w * w + k * (1.0 - q), 1e-18), 1.0))
-    rho = np.sqrt(np.where(inside, 1.0, q))
-    d = np.where(inside, (w - root) / k, (q - rho) / w)
-    by_q = np.where(inside, 0.5 / root, (1.0 - 0.5 / rho) / w)
-    by_w2 = np.where(inside, (0.5 / w - 0.5 / root) / k, -0.5 * d / (w * w))
-    by_k = np.where(inside, -(0.5 * (1.0 - q) / root + d) / k, 0.0)
+    root = np.sqrt(np.where(inside, np.maximum(w * w + k * (1.0 - q), 1e-18), q))
+    half_by_root, half_by_w = 0.5 / root, 0.5 / w
+    # outside, root is sqrt q
+    d = np.where(inside, (w - root) / k, (q - root) / w)
+    by_q = 2.0 * np.where(inside, half_by_root, (1.0 - half_by_root) / w)
+    by_w2 = 2.0 * np.where(inside, (half_by_w - half_by_root) / k, -d * half_by_w / w)
+    by_k = np.where(inside, -((1.0 - q) * half_by_root + d) / k, 0.0)
     derivative = np.empty((*x.shape, 5))
     # w2 = |B u|^2: its derivative by c needs B z with z = B v
-    derivative[..., 0] = -2.0 * (by_q * v1 + by_w2 * (b11 * z1 + b12 * z2))
-    derivative[..., 1] = -2.0 * (by_q * v2 + by_w2 * (b12 * z1 + b22 * z2))
-    derivative[..., 2] = 2.0 * (by_q * u1 * dx + by_w2 * (z1 * dx + v1 * u1)) + by_k * b22
-    derivative[..., 3] = (
-        2.0 * (by_q * (u1 * dy + u2 * dx) + by_w2 * (z1 * dy + z2 * dx + v1 * u2 + v2 * u1)) - 2.0 * by_k * b12
-    )
-    derivative[..., 4] = 2.0 * (by_q * u2 * dy + by_w2 * (z2 * dy + v2 * u2)) + by_k * b11
+    along1, along2 = by_q * u1 + by_w2 * z1, by_q * u2 + by_w2 * z2
+    derivative[..., 0] = -(b11 * along1 + b12 * along2)
+    derivative[..., 1] = -(b12 * along1 + b22 * along2)
+    derivative[..., 2] = along1 * dx + by_w2 * (v1 * u1) + by_k * b22
+    derivative[..., 3] = along1 * dy + along2 * dx + by_w2 * (v1 * u2 + v2 * u1) - 2.0 * by_k * b12
+    derivative[..., 4] = along2 * dy + by_w2 * (v2 * u2) + by_k * b11
     return d, derivative
 
 
@@ -73,6 +87,15 @@ def blurred_ellipse(shape: Array, x: Array, y: Array) -> tuple[Array, Array]:
     gradient[..., :5] = derivative * (-density / s)[..., None]
     gradient[..., 5] = density * t
     return ndtr(-t), gradient
+
+
+def profile_only(shape: Array, x: Array, y: Array, is_spot: NDArray[np.bool_]) -> Array:
+    """Profile values (n, p) of edges or spots without derivatives."""
+    value = ndtr(-signed_distance(shape, x, y) / np.exp(shape[:, 5, None]))
+    if is_spot.any():
+        q = _geometry(shape[is_spot], x[is_spot], y[is_spot])[6]
+        value[is_spot] = np.exp(-0.5 * np.minimum(q, 80.0))
+    return np.asarray(value)
 
 
 def spot(shape: Array, x: Array, y: Array) -> tuple[Array, Array]:

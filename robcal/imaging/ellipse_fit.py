@@ -1,8 +1,8 @@
 """Least-squares fit of blurred ellipses to grey values, all ellipses of a group at once.
 
 Grey value = b0 + b1 x + b2 y + (g0 + g1 x + g2 y) E(x, y): background plane, contrast with a linear gain gradient,
-step profile E of :mod:`robcal.imaging.edge_model`. x, y in the linear terms count from the window's fixed origin in
-units of the dot's radius. The gain gradient costs precision (it looks like a shift of the edge), so it carries a
+step profile E of :mod:`robcal.imaging.edge_model`. x, y in the linear terms count from the start's centre in units of
+the dot's radius. The gain gradient costs precision (it looks like a shift of the edge), so it carries a
 normal prior of zero mean whose variance is estimated from all dots of the image (empirical Bayes): no shading, no
 cost; shading, no bias. Saturated pixels are censored: they only say that the value is at least the saturation level.
 """
@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from robcal.imaging.edge_model import SHAPE_PARAMETERS, blurred_ellipse, spot
+from robcal.imaging.edge_model import SHAPE_PARAMETERS, blurred_ellipse, profile_only, spot
 from robcal.imaging.noise import NoiseModel
 from robcal.imaging.windows import Windows
 
@@ -52,6 +52,14 @@ class EllipseFits:
         """The chosen rows."""
         return EllipseFits(*(getattr(self, name)[chosen] for name in EllipseFits.__dataclass_fields__))
 
+    def replaced(self, rows: NDArray, other: EllipseFits) -> EllipseFits:
+        """A copy with `rows` taken from `other`."""
+        columns = {}
+        for name in EllipseFits.__dataclass_fields__:
+            columns[name] = getattr(self, name).copy()
+            columns[name][rows] = getattr(other, name)
+        return EllipseFits(**columns)
+
     def covariance(self) -> Array:
         """(n, 12, 12) inverse of the normal matrices; infinite centre variances where they are singular."""
         scale = 1.0 / np.sqrt(np.maximum(np.diagonal(self.normal, axis1=1, axis2=2), 1e-100))
@@ -70,9 +78,7 @@ def evaluate(parameters: Array, windows: Windows, is_spot: NDArray[np.bool_]) ->
     profile, by_shape = blurred_ellipse(shape, windows.x, windows.y)
     if is_spot.any():
         profile[is_spot], by_shape[is_spot] = spot(shape[is_spot], windows.x[is_spot], windows.y[is_spot])
-    origin = _origin(windows)
-    x = (windows.x - origin[:, 0, None]) / windows.radius[:, None]
-    y = (windows.y - origin[:, 1, None]) / windows.radius[:, None]
+    x, y = windows.u, windows.v
     b0, b1, b2, g0, g1, g2 = (parameters[:, SHAPE_PARAMETERS + k, None] for k in range(6))
     gain = g0 + g1 * x + g2 * y
     jacobian = np.empty((*x.shape, PARAMETERS))
@@ -86,13 +92,11 @@ def evaluate(parameters: Array, windows: Windows, is_spot: NDArray[np.bool_]) ->
     return b0 + b1 * x + b2 * y + gain * profile, jacobian
 
 
-def _origin(windows: Windows) -> Array:
-    """(n, 2) fixed origin of the linear terms: the first valid pixels' mean is stable under refits."""
-    count = np.maximum(windows.valid.sum(axis=1), 1)
-    return np.stack([
-        np.where(windows.valid, windows.x, 0.0).sum(axis=1) / count,
-        np.where(windows.valid, windows.y, 0.0).sum(axis=1) / count,
-    ], axis=-1)  # fmt: skip
+def grey_values(parameters: Array, windows: Windows, is_spot: NDArray[np.bool_]) -> Array:
+    """Model grey values (n, p)."""
+    profile = profile_only(parameters[:, :SHAPE_PARAMETERS], windows.x, windows.y, is_spot)
+    b0, b1, b2, g0, g1, g2 = (parameters[:, SHAPE_PARAMETERS + k, None] for k in range(6))
+    return b0 + b1 * windows.u + b2 * windows.v + (g0 + g1 * windows.u + g2 * windows.v) * profile
 
 
 def start(shape: Array, base: Array, peak: Array, windows: Windows, is_spot: NDArray[np.bool_]) -> EllipseFits:
@@ -118,15 +122,13 @@ class _System:
 
 
 def _system(
-    parameters: Array, prior_blur: Array, windows: Windows, fits: EllipseFits, noise: NoiseModel, dropped: NDArray
+    parameters: Array, prior_blur: Array, windows: Windows, fits: EllipseFits, precision: Array
 ) -> _System:
-    """Normal equations with priors at the given parameters."""
+    """Normal equations with priors at the given parameters; `precision` (n, p) of the pixels, 0 if left out."""
     model, jacobian = evaluate(parameters, windows, fits.is_spot)
     residual = windows.value - model
-    variance = noise.at(model)
     # censored: a saturated pixel below whose level the model stays is a residual, above it none
-    silent = ~windows.valid | dropped | (windows.saturated & (residual < 0))
-    weight = np.where(silent, 0.0, 1.0 / variance)
+    weight = np.where(windows.saturated & (residual < 0), 0.0, precision)
     weighted = jacobian * weight[..., None]
     normal = np.matmul(weighted.transpose(0, 2, 1), jacobian)
     right = np.einsum("npk,np->nk", weighted, residual)
@@ -165,7 +167,9 @@ def iterate(
     dropped = np.zeros(windows.valid.shape, bool) if dropped is None else dropped
     prior = fits.parameters[:, 5].copy() if prior_blur is None else prior_blur
     parameters = fits.parameters.copy()
-    system = _system(parameters, prior, windows, fits, noise, dropped)
+    # weights from the model at the start of the call: within one call the cost is one function
+    precision = np.where(windows.valid & ~dropped, 1.0 / noise.at(grey_values(parameters, windows, fits.is_spot)), 0.0)
+    system = _system(parameters, prior, windows, fits, precision)
     normal, right, cost = system.normal.copy(), system.right.copy(), system.cost.copy()
     weight, residual = system.weight.copy(), system.residual.copy()
     damping = np.full(n, 1e-4)
@@ -185,8 +189,7 @@ def iterate(
         definite = (trial[:, 2] * trial[:, 4] > trial[:, 3] ** 2) & (trial[:, 2] > 0) & np.isfinite(trial).all(axis=1)
         trial[~definite] = parameters[active[~definite]]
         sub = windows.take(active)
-        new = _system(trial, prior[active], sub, fits.take(active), noise, dropped[active])
-        # weights follow the model: compare both costs by the new weights within the noise of that change
+        new = _system(trial, prior[active], sub, fits.take(active), precision[active])
         better = definite & (new.cost <= cost[active] * (1 + 1e-9) + 1e-9)
         accepted = active[better]
         parameters[accepted] = trial[better]

@@ -177,7 +177,8 @@ def _pooled(lift: Array, variance: Array, weight: Array) -> tuple[Array, Array, 
 def correlation_factor(lag_one: float) -> float:
     """Variance of sums over neighbouring pixels by that of white noise, from the correlation of direct neighbours.
 
-    Noise is taken as a separable first-order process, whose spectrum at long waves is ((1 + r) / (1 - r))^2 of white.
+    Noise is taken as a separable first-order process, whose spectrum at long waves is ((1 + r) / (1 - r))^2 of white;
+    above r = 0.5 the residuals are texture, not noise.
     """
-    r = min(lag_one, 0.7)
+    r = min(lag_one, 0.5)
     return ((1.0 + r) / (1.0 - r)) ** 2 if r > 0.05 else 1.0

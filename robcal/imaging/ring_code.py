@@ -32,9 +32,10 @@ _MARGIN = 0.25  # a segment's brightness must keep this distance from the half
 _RMS_MAX = 0.14  # of the ring's brightness, readings minus prediction over the ring
 _PATCH_MAX = 0.42  # the same, mean over any patch of 1/4 segment by half the ring's width
 _GAP_MAX = 0.22
-_MINOR_AXIS_MIN = 1.3  # px; below it neither gap nor segments are resolved
+_MINOR_AXIS_MIN = 1.4  # px; below it neither gap nor segments are resolved
 _MINOR_BY_BLUR_MIN = 1.5
-_BRIGHT_MIN, _BRIGHT_MAX = 2, 10  # bright segments of a code that is not known beforehand
+_NOISE_MAX = 0.12  # of one pixel, by the contrast
+_BRIGHT_MIN, _BRIGHT_MAX = 3, 10  # bright segments of a code that is not known beforehand
 
 
 def canonical_id(bits: int) -> int:
@@ -149,7 +150,7 @@ def read_rings(
     sigma_angle = angular / 2.5
     evidence = np.sort(profile, axis=1)[:, -3] > _EVIDENCE
     minor = 1.0 / np.linalg.eigvalsh(_matrices(b))[:, 1]
-    resolved = (minor > _MINOR_AXIS_MIN) & (minor > _MINOR_BY_BLUR_MIN * blur)
+    resolved = (noise_sigma < _NOISE_MAX * contrast) & (minor > _MINOR_AXIS_MIN) & (minor > _MINOR_BY_BLUR_MIN * blur)
     readable = np.flatnonzero(evidence & complete & resolved & (contrast > 0))
     if readable.size == 0:
         return RingReadings(empty.code, evidence, empty.phase, empty.bits, empty.level)
@@ -171,7 +172,7 @@ def read_rings(
 def _allowed(number: int, known_codes: frozenset[int] | None) -> bool:
     if known_codes is not None:
         return number in known_codes
-    # one bright or one dark segment can be anything: dust beside a dot, a scratch across a plain ring
+    # one or two bright segments or a single dark one can be anything: dust beside a dot, a scratch across a ring
     return _BRIGHT_MIN <= number.bit_count() <= _BRIGHT_MAX
 
 
@@ -253,18 +254,23 @@ def _is_certain(fit: _Fit, ring: Array, gap: Array, factor: Array, sigma_angle: 
 def ring_glare(xy: Array, b: Array, s: Array, reading: RingReadings, row: Array, x: Array, y: Array) -> Array:
     """Predicted brightness of the ring by the dot's contrast, (n, p), at pixels (n, p), for readings `row`."""
     matrix = _matrices(b)
-    u = np.einsum("nij,npj->npi", matrix, np.stack([x - xy[:, 0, None], y - xy[:, 1, None]], axis=-1))
-    rho = np.maximum(np.hypot(u[..., 0], u[..., 1]), 1e-6)
-    normal = u / rho[..., None]
-    radial = s[:, None] * np.linalg.norm(np.einsum("nij,npj->npi", matrix, normal), axis=-1)
-    tangent = np.stack([-normal[..., 1], normal[..., 0]], axis=-1)
-    # at the ring's own radius: the glare inside comes from there
-    angular = s[:, None] * np.linalg.norm(np.einsum("nij,npj->npi", matrix, tangent), axis=-1) / 2.2
-    phi = np.arctan2(u[..., 1], u[..., 0])
-    total = np.zeros_like(rho)
+    dx, dy = x - xy[:, 0, None], y - xy[:, 1, None]
+    u, v = b[:, :1] * dx + b[:, 1:2] * dy, b[:, 1:2] * dx + b[:, 2:] * dy
+    rho = np.maximum(np.hypot(u, v), 1e-6)
+    n1, n2 = u / rho, v / rho
+    radial = s[:, None] * np.hypot(b[:, :1] * n1 + b[:, 1:2] * n2, b[:, 1:2] * n1 + b[:, 2:] * n2)
+    # around the ring the brightness depends on the angle alone; its blur is that at the ring's inner edge, from where
+    # the glare comes
+    around = np.zeros((len(xy), _ANGLES))
+    tangent = np.stack([-np.sin(_PHI), np.cos(_PHI)], axis=-1)
+    angular = s[:, None] * np.linalg.norm(np.einsum("nij,aj->nai", matrix, tangent), axis=-1) / 2.2
     for k in range(SEGMENTS):
-        lit = reading.bits[row, k]
         middle = reading.phase[row] + (k + 0.5) * _SEGMENT_ANGLE
-        total += lit[:, None] * _window(_wrap(phi - middle[:, None]), angular)
+        around += reading.bits[row, k, None] * _window(_wrap(_PHI[None] - middle[:, None]), angular)
+    place = np.arctan2(v, u) % (2.0 * np.pi) * (_ANGLES / (2.0 * np.pi)) - 0.5
+    lower = np.floor(place).astype(int)
+    part = place - lower
+    rows = np.arange(len(xy))[:, None]
+    total = around[rows, lower % _ANGLES] * (1.0 - part) + around[rows, (lower + 1) % _ANGLES] * part
     across = ndtr((rho - 2.0) / radial) - ndtr((rho - 3.0) / radial)
     return reading.level[row][:, None] * total * across

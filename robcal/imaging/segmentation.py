@@ -21,8 +21,8 @@ from robcal.imaging.settings import DetectionSettings
 
 Array = NDArray[np.float64]
 
-_MAX_NODES = 6000  # thresholds tried in one image; a photograph of something else must not take minutes
-_MAX_PARTS = 4000  # connected parts above the background, holes included; beyond, the threshold is raised
+_MAX_NODES = 5000  # thresholds tried in one image; a photograph of something else must not take minutes
+_MAX_PARTS = 3000  # connected parts above the background, holes included; beyond, the threshold is raised
 _MAX_DEPTH = 7
 _CROSS = np.ones((5, 5), np.uint8)
 
@@ -138,7 +138,7 @@ def _first_nodes(
             small += 1
             continue
         x, y, width, height = cv2.boundingRect(contour)
-        if width * height < 4:
+        if width * height < 4 or min(width, height) < settings.min_axis_px:
             small += 1
             continue
         px, py = (int(value) for value in contour[0, 0])
@@ -259,3 +259,34 @@ def _judge(
     angle = 0.5 * np.arctan2(2.0 * sxy, sxx - syy)
     found.append((x + cx, y + cy, major, minor, float(angle), base, peak, float(np.clip(blur, 0.35, 0.5 * minor + 0.5))))
     return None
+
+
+def step_all_around(image: NDArray, candidates: Candidates) -> NDArray[np.bool_]:
+    """(n,) True where the grey value falls across the outline in nearly every direction and about equally.
+
+    A cheap test before the fit: parts of textures, corners and arcs fail it, dots beside others do not.
+    """
+    n = len(candidates)
+    if n == 0:
+        return np.zeros(0, bool)
+    height, width = image.shape
+    phi = np.arange(24) * (2.0 * np.pi / 24)
+    c, s = np.cos(candidates.angle)[:, None], np.sin(candidates.angle)[:, None]
+    a, b = candidates.semi_axes[:, :1], candidates.semi_axes[:, 1:]
+    # outline, and its normal
+    ex, ey = a * np.cos(phi), b * np.sin(phi)
+    nx, ny = np.cos(phi) / a, np.sin(phi) / b
+    length = np.hypot(nx, ny)
+    reach = np.minimum(1.5 * candidates.blur + 1.0, 0.7 * b[:, 0])[:, None]
+    out = np.minimum(1.5 * candidates.blur[:, None] + 1.0, 0.55 * b + 0.8)
+    values = []
+    for distance in (-reach, out):
+        ux, uy = ex + distance * nx / length, ey + distance * ny / length
+        x = np.clip(np.rint(candidates.xy[:, :1] + c * ux - s * uy), 0, width - 1).astype(int)
+        y = np.clip(np.rint(candidates.xy[:, 1:] + s * ux + c * uy), 0, height - 1).astype(int)
+        values.append(image[y, x].astype(float))
+    inner, outer = values
+    step = inner - outer
+    typical = np.median(step, axis=1)
+    low = np.sort(step, axis=1)[:, 3]
+    return (typical > 0) & (low > 0.15 * typical) & (np.median(np.abs(step - typical[:, None]), axis=1) < 0.35 * typical)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from robcal.imaging.edge_model import edge_distance, matrix_from_axes
+from robcal.imaging.edge_model import matrix_from_axes, signed_distance
 from robcal.imaging.segmentation import Candidates
 
 Array = NDArray[np.float64]
@@ -23,6 +23,7 @@ class Windows:
     Attributes
     ----------
     index : (n,) rows of the candidates. x, y, value : (n, p). valid : (n, p) bool.
+    u, v : (n, p) x and y from the start's centre in units of its radius.
     radius : (n,) geometric mean of the start's semi-axes, px.
     inside : (n, p) bool, well inside the edge. saturated : (n, p) bool.
     """
@@ -30,6 +31,8 @@ class Windows:
     index: NDArray[np.int64]
     x: Array
     y: Array
+    u: Array
+    v: Array
     value: Array
     valid: NDArray[np.bool_]
     radius: Array
@@ -70,7 +73,7 @@ def gather_windows(
     shape = np.column_stack([
         candidates.xy, matrix_from_axes(candidates.semi_axes, candidates.angle), np.log(np.maximum(candidates.blur, 0.3))
     ])  # fmt: skip
-    margin = 3.0 * candidates.blur + 2.0
+    margin = 3.0 * candidates.blur + 1.5
     # half extents of the ellipse along x and y
     c2, s2 = np.cos(candidates.angle) ** 2, np.sin(candidates.angle) ** 2
     a2, b2 = candidates.semi_axes[:, 0] ** 2, candidates.semi_axes[:, 1] ** 2
@@ -102,7 +105,7 @@ def _gather(
     n, side = len(chosen), len(offset)
     x = np.broadcast_to(columns[:, None, :], (n, side, side)).astype(float)
     y = np.broadcast_to(rows[:, :, None], (n, side, side)).astype(float)
-    distance = edge_distance(shape[chosen], x.reshape(n, -1), y.reshape(n, -1))[0].reshape(n, side, side)
+    distance = signed_distance(shape[chosen], x.reshape(n, -1), y.reshape(n, -1)).reshape(n, side, side)
     blur = candidates.blur[chosen][:, None, None]
     valid = within & (distance < margin[chosen][:, None, None])
     if neighbours:
@@ -120,8 +123,8 @@ def _gather(
     def flat(array: NDArray) -> NDArray:
         return np.take_along_axis(array.reshape(n, -1), order, axis=1)
 
-    value = flat(values)
-    return Windows(
-        chosen, flat(x), flat(y), value, flat(valid), np.sqrt(np.prod(candidates.semi_axes[chosen], axis=1)),
-        flat(inside), value >= saturation,
-    )  # fmt: skip
+    px, py, value = flat(x), flat(y), flat(values)
+    radius = np.sqrt(np.prod(candidates.semi_axes[chosen], axis=1))
+    start = candidates.xy[chosen]
+    u, v = (px - start[:, :1]) / radius[:, None], (py - start[:, 1:]) / radius[:, None]
+    return Windows(chosen, px, py, u, v, value, flat(valid), radius, flat(inside), value >= saturation)
