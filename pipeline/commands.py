@@ -44,7 +44,7 @@ def diagnose_place(
     if is_run(place):
         run = open_run(place)
         campaign, out = campaign_of(run), run.folder
-        if not campaign.exists():
+        if not (campaign / "campaign.yaml").is_file():
             raise InvalidInput(f"{place}: its campaign {campaign} is gone: the diagnosis needs the recordings")
     else:
         campaign = place
@@ -68,7 +68,7 @@ def run_demo(folder: Path, messages: Messages, workers: int | None) -> Done:
     from fixtures.demo import render_demo
 
     campaign = folder / "campaign"
-    if not campaign.exists():
+    if not (campaign / "campaign.yaml").is_file():
         messages.info(f"rendering a campaign in {folder} ...")
         try:
             folder.mkdir(parents=True, exist_ok=True)

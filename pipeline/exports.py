@@ -8,6 +8,7 @@ from pipeline.calibrated import load_calibrated
 from pipeline.files import write_text
 from pipeline.runs import open_run
 from robcal.robot.c_export import export_c
+from robcal.robot.urdf import urdf_text
 
 
 def export_run(folder: Path, c: Path | None, urdf: Path | None) -> list[Path]:
@@ -25,8 +26,6 @@ def export_run(folder: Path, c: Path | None, urdf: Path | None) -> list[Path]:
             write_text(c / name, text)
             written.append(c / name)
     if urdf is not None:
-        from robcal.robot.urdf import urdf_text
-
         write_text(urdf, urdf_text(calibrated.model))
         written.append(urdf)
     return written

@@ -15,6 +15,7 @@ from pipeline.poses_table import Poses
 from pipeline.robot_file import write_robot
 from pipeline.runs import Run
 from pipeline.stages.base import Context, Outcome, Stage
+from pipeline.stages.joint_log import check_joint_log
 from pipeline.stages.observations import RobotObservations, RobotRecording, Rows, build_recording, rescaled
 from robcal.calibration.identification import IdentifiedRobot, IdentifyOptions, identify
 from robcal.calibration.observations import FrameObservations
@@ -72,13 +73,15 @@ def work(context: Context) -> Outcome:
     kernel = Kernel(robot, campaign.entry.model.statics)
     inputs = recorded_inputs(kernel, poses)
     options = options_of(campaign, recording.stated)
+    nominal = fit_nominal(robot, inputs.subset(rows), recording.select(rows))
+    warning = check_joint_log(robot, poses, inputs, recording, rows, nominal)
     found, recording = identify_recording(robot, inputs, recording, rows, options, kernel)
-    check_fit(campaign, robot, inputs, recording, rows, found)
-    calibrated = calibrated_robot(robot, poses, inputs, recording, rows, found)
+    calibrated = calibrated_robot(poses, inputs, found, nominal.model)
     facts = {f.name: getattr(found, f.name) for f in fields(found) if f.name != "kernel"}
     outputs = [run.save(NAME, Identification(rows, facts, recording)), run.save(f"calibrated_{NAME}", calibrated)]
     write_robot(run.robot, found.model, f"calibrated from campaign {campaign.name}, before the diagnosis")
-    return Outcome({"identification": _result(found, rows)}, outputs, [*recording.notes, *_notes(found, poses, rows)])
+    notes = [*recording.notes, *([warning] if warning else []), *_notes(found, poses, rows)]
+    return Outcome({"identification": _result(found, rows)}, outputs, notes)
 
 
 def require_robot(campaign: Campaign) -> tuple[RobotModel, Poses]:
@@ -142,16 +145,8 @@ def variance_factors(
     return factors
 
 
-def calibrated_robot(
-    robot: RobotModel,
-    poses: Poses,
-    inputs: PoseInputs,
-    recording: RobotRecording,
-    rows: Rows,
-    found: IdentifiedRobot,
-) -> Calibrated:
+def calibrated_robot(poses: Poses, inputs: PoseInputs, found: IdentifiedRobot, nominal: RobotModel) -> Calibrated:
     """The calibrated robot beside the nominal one in its best cell, with what predictions need."""
-    nominal = fit_nominal(robot, inputs.subset(rows), recording.select(rows)).model
     return Calibrated(
         model=found.model,
         nominal=nominal,
@@ -162,13 +157,6 @@ def calibrated_robot(
         tools=found.kernel.frames(found.full_theta, inputs),
         defaults=defaults_of(poses),
     )
-
-
-def check_fit(
-    campaign: Campaign, robot: RobotModel, inputs: PoseInputs, recording: RobotRecording, rows: Rows,
-    found: IdentifiedRobot,
-) -> None:
-    """Hook for faults of the joint log."""
 
 
 def _result(found: IdentifiedRobot, rows: Rows) -> dict[str, Any]:
@@ -220,6 +208,7 @@ STAGE = Stage(
         "robcal/transforms.py",
         "pipeline/stages/identify.py",
         "pipeline/stages/observations.py",
+        "pipeline/stages/joint_log.py",
         "pipeline/calibrated.py",
     ),
 )

@@ -75,7 +75,10 @@ def build_recording(campaign: Campaign, run: Run, body: Body | None) -> RobotRec
         stated &= points.covariance is not None
         if len(frames.pose):
             observations.append(frame_observations(frames))
-            detailed.append(_used_points(points, frames, body) or observations[-1])
+            # Points of the own station share the errors of its cameras and of the surveyed body, which repeat in every
+            # pose: what they tell about targets and cameras is judged where these are adjusted, with their covariance.
+            own_station = points.station_jacobian is not None
+            detailed.append(observations[-1] if own_station else _used_points(points, frames, body) or observations[-1])
     for table in campaign.measurements:
         if table.kind == "points" and observations and run.has("frames"):
             continue

@@ -55,6 +55,9 @@ def survey_one(campaign: Campaign, run: Run, name: str, source: BodySource) -> S
         BodyTarget(t.id, t.code, t.diameter, t.xyz, None if t.sigma is None else max(t.sigma))
         for t in source.file.targets
     ]
+    listed = {t.id for t in targets}
+    stated = {number for length in [*entry.scale_bars, *entry.check_lengths] for number in length.targets}
+    targets += [BodyTarget(number, "ring12") for number in sorted(stated - listed)]
     datum = tuple(entry.datum.fixed) if isinstance(entry.datum, FixedDatum) else entry.datum
     try:
         return survey_body(
