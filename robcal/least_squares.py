@@ -14,7 +14,7 @@ from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg, stats
+from scipy import linalg, special
 
 from robcal.errors import InvalidInput
 
@@ -38,7 +38,7 @@ class TerminationSettings:
 
     max_iterations: int = 30
     max_halvings: int = 12
-    cost_tolerance: float = 1e-9
+    cost_tolerance: float = 1e-8
 
 
 @dataclass(frozen=True)
@@ -160,7 +160,11 @@ class Eliminated:
 
 
 def split_dependent(
-    N: Array, names: Sequence[str], limits: Array | None = None, relative_pivot: float = RELATIVE_PIVOT
+    N: Array,
+    names: Sequence[str],
+    limits: Array | None = None,
+    relative_pivot: float = RELATIVE_PIVOT,
+    ties: bool = True,
 ) -> tuple[list[int], list[Eliminated]]:
     """Walk through the parameters in the given order; keep those that the ones kept so far cannot replace.
 
@@ -173,6 +177,7 @@ def split_dependent(
     names : names (p,).
     limits : largest sigma (p,) worth keeping; None for no such limit.
     relative_pivot : pivot over diagonal below which a column counts as dependent.
+    ties : find out what the eliminated ones are tied to (else ``tied_to`` stays empty).
 
     Returns
     -------
@@ -202,15 +207,17 @@ def split_dependent(
         row = work[k, k + 1 :] / pivot
         work[k + 1 :, k + 1 :] -= np.outer(work[k + 1 :, k], row)
     eliminated = []
+    if dropped and not ties:
+        return kept, [Eliminated(names[k], reason, {}, sigma) for k, reason, sigma in dropped]
     if dropped:
         Nk = N[np.ix_(kept, kept)] / np.outer(scale[kept], scale[kept])
         right = N[np.ix_(kept, [k for k, _, _ in dropped])] / scale[kept][:, None]
-        ties = linalg.lstsq(Nk, right, cond=1e-14)[0] if kept else np.zeros((0, len(dropped)))
+        shares = linalg.lstsq(Nk, right, cond=1e-14)[0] if kept else np.zeros((0, len(dropped)))
         for column, (k, reason, sigma) in enumerate(dropped):
-            share = ties[:, column] / scale[k]  # in units of column norms: comparable between metres and radians
+            share = shares[:, column] / scale[k]  # in units of column norms: comparable between metres and radians
             strong = np.flatnonzero(np.abs(share) > 0.02 * max(1e-300, np.abs(share).max(initial=0.0)))
             tied = {} if reason == "no influence" else {
-                names[kept[s]]: float(ties[s, column] / scale[kept[s]]) for s in strong
+                names[kept[s]]: float(shares[s, column] / scale[kept[s]]) for s in strong
             }
             eliminated.append(Eliminated(names[k], reason, tied, sigma))
     return kept, eliminated
@@ -258,4 +265,4 @@ def global_test(cost: float, redundancy: int) -> tuple[float, float]:
     """sigma0 and the p-value of a residual sum as large or larger (chi-square) if the stated covariance holds."""
     if redundancy <= 0:
         return 1.0, 1.0
-    return float(np.sqrt(2.0 * cost / redundancy)), float(stats.chi2.sf(2.0 * cost, redundancy))
+    return float(np.sqrt(2.0 * cost / redundancy)), float(special.chdtrc(redundancy, 2.0 * cost))

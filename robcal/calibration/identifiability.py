@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import linalg, stats
+from scipy import linalg, special
 
 from robcal.errors import InvalidInput, NotIdentifiable
 from robcal.robot.model import ANGLE_OF_AXIS, ELASTIC_KINDS, GEOMETRIC_KINDS, RobotModel
@@ -171,7 +171,7 @@ def choose_by_evidence(N: Array, b: Array, rest: float, rows: int, forced: int, 
 
     def p_value(drop: float, total: float, n_chosen: int) -> float:
         freedom = rows - forced - n_chosen
-        return float(stats.f.sf(drop / (total / freedom), 1, freedom)) if freedom > 0 and total > 0 else 1.0
+        return float(special.fdtrc(1, freedom, max(0.0, drop) * freedom / total)) if freedom > 0 and total > 0 else 1.0
 
     chosen = [k for k in alive if k < n_own]
     for _ in range(4 * m + 4):

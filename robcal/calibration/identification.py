@@ -14,7 +14,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import special
 
 from robcal import transforms as tf
 from robcal.calibration.identifiability import (
@@ -93,7 +93,8 @@ class IdentifiedRobot:
     residuals : (n, D) whitened residuals by pose; normalised : (n,) their studentised norm per degree of freedom
         (near one); leverage : (n,) share of a pose's rows in its own prediction; redundancy_numbers : (n,).
     outliers : rows of poses left out; used : (n,) mask of the others.
-    summary : of the last iteration; iterations counts all Gauss-Newton steps; seconds : kernel, start and solution.
+    first_summary, summary : of the first iteration (from the start values) and of the last one, after the choice of
+        parameters; iterations counts all Gauss-Newton steps; seconds : kernel, start and solution.
     """
 
     model: RobotModel
@@ -118,6 +119,7 @@ class IdentifiedRobot:
     outliers: tuple[int, ...]
     used: NDArray[np.bool_]
     options: IdentifyOptions
+    first_summary: SolveSummary
     summary: SolveSummary
     iterations: int
     seconds: float
@@ -179,7 +181,10 @@ def identify(
     if options.objective == "basis":
         as_points: list[Observations] = []
         for o in observations:
-            as_points.append(basis_points(o) if isinstance(o, FrameObservations) else o)
+            if isinstance(o, FrameObservations):
+                as_points.append(basis_points(o))
+            else:
+                as_points.append(o)
         observations = as_points
     stack = Stack(observations, len(poses))
     check_poses(poses.q, stack.rows, ())
@@ -248,6 +253,7 @@ class _Solution:
     names: tuple[str, ...]
     eliminated: dict[str, Eliminated]
     rejected: dict[str, float]
+    first: SolveSummary
     summary: SolveSummary
     iterations: int
 
@@ -261,19 +267,22 @@ class _Engine:
         self.evaluator, self.options, self.choice = evaluator, options, choice
         self.kernel, self.poses, self.stack = evaluator.kernel, evaluator.poses, evaluator.stack
         self.scatter = 1.0
+        self._whitened: tuple[State, Array] | None = None
         self.priors = {self.kernel.index[name]: s for name, s in options.priors.items()}
 
     def columns(self, names: Sequence[str]) -> list[int]:
         return [self.kernel.index[n] for n in names]
 
     def problem(self, state: State, names: Sequence[str], weights: Array) -> Problem:
-        W = whitening(self.evaluator, state, self.options.joint_sigma)
-        return Problem(self.evaluator, self.columns(names), W, weights, self.priors)
+        if self._whitened is None or self._whitened[0] is not state:
+            self._whitened = (state, whitening(self.evaluator, state, self.options.joint_sigma))
+        return Problem(self.evaluator, self.columns(names), self._whitened[1], weights, self.priors)
 
     def solve(self, state: State, weights: Array, names: Sequence[str] | None = None) -> _Solution:
         """Eliminate, iterate, and look again at the solution whether the elimination still holds."""
         names = (*self.choice.forced, *self.choice.own_axis) if names is None else tuple(names)
         iterations = 0
+        first: SolveSummary | None = None
         kept, eliminated = self._eliminate(state, names, weights)
         for round_ in range(4):
             problem = self.problem(state, kept, weights)
@@ -281,6 +290,7 @@ class _Engine:
                 problem.linearise, problem.residuals, problem.retract, state, self.options.termination
             )
             iterations += summary.iterations
+            first = summary if first is None else first
             # After a fit the data's own scatter tells how far the stated covariance can be trusted.
             rows = int(weights.astype(bool) @ self.stack.used.sum(axis=1))
             self.scatter = max(1.0, float(np.sqrt(2.0 * summary.cost / max(1, rows - len(kept)))))
@@ -295,7 +305,7 @@ class _Engine:
             if lost:
                 state = self._reset(state, lost)
             kept = again
-        return _Solution(problem, state, tuple(kept), eliminated, {}, summary, iterations)
+        return _Solution(problem, state, tuple(kept), eliminated, {}, first or summary, summary, iterations)
 
     def choose(self, solution: _Solution, weights: Array) -> _Solution:
         """Choose among the elasticities at a solution and iterate with those that stay."""
@@ -306,7 +316,7 @@ class _Engine:
         r, J = problem.linearise(solution.state)
         current = np.array([solution.state.theta[self.kernel.index[n]] for n in (*own, *cross)])
         r = r + J[:, len(forced) :] @ current  # residuals for all optional parameters at zero
-        keep, _ = split_dependent(J.T @ J, names, self._limits(solution.state, names))
+        keep, _ = split_dependent(J.T @ J, names, self._limits(solution.state, names), ties=False)
         optional = [k for k in keep if k >= len(forced)]
         chosen_from = [*range(len(forced)), *optional]
         n_own = sum(1 for k in optional if k < len(forced) + len(own))
@@ -323,7 +333,7 @@ class _Engine:
         else:
             final = self.solve(state, weights, (*self.choice.forced, *taken))
         iterations = solution.iterations + (final.iterations if final is not solution else 0)
-        return replace(final, rejected=rejected, iterations=iterations)
+        return replace(final, rejected=rejected, first=solution.first, iterations=iterations)
 
     def _reset(self, state: State, names: Sequence[str]) -> State:
         theta = state.theta.copy()
@@ -340,7 +350,7 @@ class _Engine:
     ) -> tuple[list[str], dict[str, Eliminated]]:
         """Names that stay, in order, and all that were eliminated, those of ``before`` included."""
         _, J = self.problem(state, names, weights).linearise(state)
-        kept, gone = split_dependent(J.T @ J, names, self._limits(state, names))
+        kept, gone = split_dependent(J.T @ J, names, self._limits(state, names), ties=before is not None)
         if not kept:
             raise NotIdentifiable("the measurements do not depend on any parameter of the robot", names)
         stay = [names[k] for k in kept]
@@ -380,8 +390,8 @@ def _outliers(solution: _Solution, stack: Stack) -> list[int]:
     measured = count > 0
     if measured.sum() < 8:
         return []
-    typical = float(np.median(square[measured] / (stats.chi2.median(count[measured]) / count[measured])))
-    limit = stats.chi2.isf(OUTLIER_LEVEL / measured.sum(), np.maximum(count, 1)) / np.maximum(count, 1)
+    typical = float(np.median(square[measured] / (special.chdtri(count[measured], 0.5) / count[measured])))
+    limit = special.chdtri(np.maximum(count, 1), OUTLIER_LEVEL / measured.sum()) / np.maximum(count, 1)
     return np.flatnonzero(measured & (square > limit * max(typical, 1e-300) * 1.5)).tolist()
 
 
@@ -392,7 +402,7 @@ def _without_outliers(
     n = stack.n
     weights = np.ones(n)
     solution: _Solution | None = None
-    for _ in range(6):
+    for _ in range(4):
         weights = np.ones(n)
         weights[suspects] = 0.0
         if len(suspects) > max(1, OUTLIER_SHARE * n):
@@ -401,8 +411,8 @@ def _without_outliers(
         solution = engine.solve(state, weights)
         _, square, _, _ = _pose_statistics(solution, weights, stack)
         count = np.maximum(stack.used.sum(axis=1), 1)
-        typical = float(np.median((square / (stats.chi2.median(count) / count))[weights > 0]))
-        limit = stats.chi2.isf(OUTLIER_LEVEL / n, count) / count * typical * 1.5
+        typical = float(np.median((square / (special.chdtri(count, 0.5) / count))[weights > 0]))
+        limit = special.chdtri(count, OUTLIER_LEVEL / n) / count * typical * 1.5
         now = np.flatnonzero(square > limit).tolist()
         if set(now) == set(suspects):
             break
@@ -447,7 +457,8 @@ def _result(
         condition_raw=statistics.condition_raw, correlations=statistics.correlations,
         observability=observability_indices(statistics.singular_values), residuals=residuals,
         normalised=np.sqrt(square), leverage=leverage, redundancy_numbers=numbers, outliers=tuple(outliers),
-        used=weights > 0, options=options, summary=solution.summary, iterations=solution.iterations,
+        used=weights > 0, options=options, first_summary=solution.first,
+        summary=solution.summary, iterations=solution.iterations,
         seconds=time.perf_counter() - clock, seconds_kernel=seconds_kernel,
     )
 

@@ -26,8 +26,12 @@ Self = TypeVar("Self", bound="_Rows")
 class Observations(Protocol):
     """What the solver needs of any kind of measurement."""
 
-    pose: Ints
     dimension: ClassVar[int]
+
+    @property
+    def pose(self) -> Ints:
+        """Row of the pose of each measurement (m,)."""
+        ...
 
     def evaluate(self, T: Array) -> tuple[Array, Array]:
         """Residuals (m, d) and derivative (m, d, 6) of the model by the tool's right twist; T is (n, 4, 4)."""
