@@ -74,7 +74,7 @@ def model_from_urdf(text: str, base: str | None = None, tip: str | None = None) 
     return RobotModel(str(robot.name or "robot"), (*frames, end))
 
 
-def model_to_urdf(model: RobotModel, template: str | None = None) -> str:
+def urdf_text(model: RobotModel, template: str | None = None) -> str:
     """URDF of a robot with its geometric deviations included; elasticities and terms are left out.
 
     Parameters

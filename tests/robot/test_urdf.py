@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from robcal.errors import InvalidInput
 from robcal.robot.chain import chain_of, forward
 from robcal.robot.model import Frame, RobotModel
-from robcal.robot.urdf import model_from_urdf, model_to_urdf
+from robcal.robot.urdf import model_from_urdf, urdf_text
 from tests.robot.chains import kr_like, random_chain
 
 pytest.importorskip("yourdfpy")
@@ -84,7 +84,7 @@ def test_masses_and_their_centres_agree_with_pinocchio(seed):
 def test_robot_survives_the_round_trip(seed):
     rng = np.random.default_rng(seed)
     model = random_chain(rng)
-    back = model_from_urdf(model_to_urdf(model))
+    back = model_from_urdf(urdf_text(model))
     q = rng.uniform(-1, 1, (4, model.n_joints))
     assert forward(chain_of(back), q) == pytest.approx(forward(chain_of(model), q), abs=1e-12)
     assert sum(f.mass for f in back.joints) <= sum(f.mass for f in model.frames) + 1e-9
@@ -92,7 +92,7 @@ def test_robot_survives_the_round_trip(seed):
 
 def test_direct_joints_keep_their_numbers():
     model = kr_like()
-    back = model_from_urdf(model_to_urdf(model))
+    back = model_from_urdf(urdf_text(model))
     for before, after in zip(model.joints, back.joints, strict=True):
         assert (after.name, after.axis, after.sign) == (before.name, before.axis, before.sign)
         assert after.xyz == pytest.approx(before.xyz, abs=1e-15)
@@ -109,7 +109,7 @@ def test_template_gets_the_calibrated_geometry_and_keeps_its_meshes(seed):
     real = nominal.with_parameters(
         {f"{f.name}.{k}": 1e-3 * rng.normal() for f in nominal.frames[:-1] for k in kinds}
     )
-    written = model_to_urdf(real, template=text)
+    written = urdf_text(real, template=text)
     assert written.count("<mesh") == text.count("<mesh")
     from robcal.robot.urdf import calibrated_frames
 
@@ -141,4 +141,4 @@ def test_bad_descriptions_are_refused(text, words):
 def test_template_of_another_robot_is_refused():
     other = RobotModel("other", (Frame("only", "z"), Frame("flange")))
     with pytest.raises(InvalidInput, match="read from"):
-        model_to_urdf(other, template=model_to_urdf(kr_like()))
+        urdf_text(other, template=urdf_text(kr_like()))
