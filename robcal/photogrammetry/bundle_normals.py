@@ -231,7 +231,7 @@ class Factor:
         self.equilibrated = S
         B = np.zeros((a, constraints.shape[1]))
         B[self.k :] = constraints
-        self.constraints = B[free] / self.scale[:, None]
+        self.constraints = B[free] * self.scale[:, None]
         if constraints.shape[1]:
             self.constraints /= np.max(np.abs(self.constraints))
             S = S + self.constraints @ self.constraints.T

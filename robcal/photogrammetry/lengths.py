@@ -65,16 +65,15 @@ def bars_scale(
     design = linalg.solve_triangular(root, distance, lower=True)
     if scale_free:
         factor = float(design @ linalg.solve_triangular(root, lengths.length, lower=True) / (design @ design))
-    error = factor * distance - lengths.length
-    if scale_free:
-        C = C - np.outer(distance, distance) / (design @ design)
-    elif len(lengths) == 0:
-        return factor, ""
-    sigma = np.sqrt(np.maximum(np.diag(C), 1e-4 * lengths.sigma**2))
-    w = error / sigma
-    worst = int(np.argmax(np.abs(w)))
     if len(lengths) < 2 and scale_free:
         return factor, ""
+    error = factor * distance - lengths.length
+    # w-test for correlated observations (Baarda): the culprit has the largest one also where lengths are correlated
+    P = linalg.cho_solve((root, True), np.eye(len(lengths)))
+    if scale_free:
+        P = P - np.outer(P @ distance, P @ distance) / (design @ design)
+    w = P @ error / np.sqrt(np.maximum(np.diag(P), 1e-300))
+    worst = int(np.argmax(np.abs(w)))
     names = [f"{a}-{b}" for a, b in lengths.ids.tolist()]
     ratio = lengths.length / distance
     if abs(w[worst]) > _NOTE:

@@ -21,7 +21,7 @@ from robcal.photogrammetry.camera import Camera, project
 from robcal.photogrammetry.datum import Datum
 from robcal.photogrammetry.determinacy import intrinsics_basis
 from robcal.photogrammetry.network import ImageMarks
-from robcal.photogrammetry.start_planar import best_references, planar_starts
+from robcal.photogrammetry.start_planar import best_references, plane_share, planar_starts
 from robcal.photogrammetry.start_resection import ideal_points, resect, robust_cost
 from robcal.transforms import Array, frame
 
@@ -152,9 +152,18 @@ class _Builder:
         if known_points is not None and np.count_nonzero(np.isfinite(known_points[:, 0])) >= 4:
             for f in self.focal_candidates():
                 yield replace(self.empty(self.with_focal(f)), points=np.array(known_points))
-        for reference in best_references(self.marks, self.images, self.targets):
+        references = best_references(self.marks, self.images, self.targets)
+        flat = len(references) > 0 and plane_share(self.marks, int(references[0]), self.targets, self.size) > 0.8
+        makers = [self._planes(references), self._pairs(core)]
+        for maker in makers if flat else makers[::-1]:
+            yield from maker
+
+    def _planes(self, references: NDArray[np.int64]) -> Iterator[StartNetwork]:
+        for reference in references:
             for start in planar_starts(self.marks, int(reference), self.targets, self.camera, self.focal_known):
                 yield replace(self.empty(self.with_focal(start.focal)), points=start.points)
+
+    def _pairs(self, core: NDArray[np.int64]) -> Iterator[StartNetwork]:
         pairs = [(int(i), int(j)) for a, i in enumerate(core) for j in core[:a] if self.common[i, j] >= 6]
         pairs.sort(key=lambda p: -self.common[p])
         for i, j in pairs[:6]:
@@ -281,11 +290,13 @@ class _Builder:
         return replace(network, fits=length < 3.0 * scale, cost=robust_cost(length[mine], 0.25 * self.tolerance(False)))
 
     def is_good(self, network: StartNetwork, core: NDArray[np.int64]) -> bool:
-        """Nearly all marks of the core fit within a thousandth of the image."""
-        mine = np.isin(self.marks.image, core)
-        length = self._lengths(network)[mine]
-        return bool(np.mean(length < 0.001 * self.size) > 0.85) and (
-            self.focal_known or bool(np.median(length) < 5e-4 * self.size)
+        """Most marks of the core are reached, and nearly all of these fit within a thousandth of the image."""
+        length = self._lengths(network)[np.isin(self.marks.image, core)]
+        reached = length[np.isfinite(length)]
+        return (
+            len(reached) > 0.6 * len(length)
+            and bool(np.mean(reached < 0.001 * self.size) > 0.9)
+            and (self.focal_known or bool(np.median(reached) < 5e-4 * self.size))
         )
 
     def _lengths(self, network: StartNetwork) -> Array:

@@ -28,6 +28,22 @@ class PlanarStart:
     cost: float
 
 
+def plane_share(marks: ImageMarks, reference: int, targets: int, size: float) -> float:
+    """Share of marks that homographies from the reference explain to half a per cent of the image: near 1 for a plane."""
+    shares = []
+    lookup = np.full((targets, 2), np.nan)
+    own = marks.image == reference
+    lookup[marks.target[own]] = marks.xy[own]
+    for image in np.unique(marks.image):
+        rows = np.flatnonzero((marks.image == image) & np.isfinite(lookup[marks.target, 0]))
+        if image == reference or len(rows) < 6:
+            continue
+        _, mask = cv2.findHomography(lookup[marks.target[rows]], marks.xy[rows], cv2.RANSAC, 0.005 * size)
+        # four points always fit
+        shares.append(0.0 if mask is None else (float(mask.sum()) - 4.0) / (len(rows) - 4.0))
+    return float(np.median(shares)) if shares else 1.0
+
+
 def homographies(marks: ImageMarks, reference: int, targets: int, tolerance: float) -> list[tuple[int, Array]]:
     """(image, H) with ``xy_image ~ H xy_reference`` for images that share at least five targets with the reference."""
     lookup = np.full((targets, 2), np.nan)

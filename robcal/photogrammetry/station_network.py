@@ -97,7 +97,8 @@ class StationSettings:
 class Evidence:
     """Something in the data that contradicts the model again and again, with its test.
 
-    ``kind``: 'camera_moved', 'target_shifted', 'image_rejected', 'lens' ; ``where``: camera or target; ``pose``: first
+    ``kind``: 'camera_moved', 'target_shifted', 'target_swapped' (``where``: both ids), 'lens_radial', 'lens_tangential',
+    'lens_affinity'; ``where``: camera or target; ``pose``: first
     pose concerned or None; ``estimate`` and ``covariance`` in the units of the kind (shift m, turn rad in the camera's
     or the body's coordinates); ``statistic`` chi-square with ``degrees`` of freedom; ``statement`` a sentence.
     """
@@ -116,7 +117,7 @@ class Evidence:
 class RejectedMark:
     """A mark left out: camera, pose number, target id (-1: the whole image) and why.
 
-    ``kind``: 'outlier' (one mark), 'contradiction' (the image does not fit the other cameras) or 'no_pose' (the image
+    ``kind``: 'outlier' (one mark), 'recurring' (most marks of its target: the target is to blame), 'contradiction' (the image does not fit the other cameras) or 'no_pose' (the image
     alone carries no pose; its marks may still be intersected).
     """
 
