@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from robcal.calibration.collision import HalfSpace, link_capsules, obstacle_clearance, place_capsules
+from robcal.calibration.identification import IdentifyOptions, identify, predict_frames
+from robcal.calibration.observations import FrameObservations
 from robcal.calibration.pose_candidates import Cell, check_poses, find_candidates
 from robcal.calibration.pose_choice import (
     Design,
@@ -25,8 +27,9 @@ from robcal.errors import InvalidInput
 from robcal.photogrammetry.bodies import Body
 from robcal.photogrammetry.camera import Camera
 from robcal.robot.chain import chain_of, forward
+from robcal.robot.kernel import Kernel
 from robcal.robot.model import Frame, RobotModel
-from robcal.transforms import frame, frame_from_xyzrpy
+from robcal.transforms import frame, frame_from_xyzrpy, retract, transform
 from tests.robot.chains import kr_like
 
 LIMITS = [(-3.0, 3.0), (-2.4, 0.2), (-2.0, 2.5), (-3.1, 3.1), (-2.1, 2.1), (-3.1, 3.1)]
@@ -233,3 +236,28 @@ def test_cell_without_view_says_so():
     behind = tuple(Viewpoint(v.name, v.camera, looking_at((4.8, 0, 1.6), (9.0, 0.0, 1.2))) for v in VIEWS)
     with pytest.raises(InvalidInput, match="most fail by visibility"):
         find_candidates(MODEL, replace(CELL, viewpoints=behind), 5, np.random.default_rng(0), most=5000)
+
+
+def test_predicted_accuracy_is_what_an_identification_reaches():
+    """Robots drawn, measured at the planned poses and identified: their tool errors scatter as predicted."""
+    cell = Cell(frame_from_xyzrpy([0.3, 0.2, 0.1, 0, 0.01, 0.5]), frame_from_xyzrpy([0.05, 0, 0.2, 0, 0.1, 0]))
+    points = ((0.0, 0.0, 0.0), (0.2, 0.2, 0.4))
+    request = PoseRequest(MODEL, cell, count=45, parameters="geometry", candidates=300, test_points=points)
+    plan = generate_poses(request)
+    rng = np.random.default_rng(8)
+    kinds = ("x", "y", "z", "roll", "pitch", "yaw")
+    elsewhere = find_candidates(MODEL, cell, 200, rng).q
+    squares = []
+    for _ in range(4):
+        values = {f"{f.name}.{k}": 5e-4 * rng.normal() for f in MODEL.frames for k in kinds}
+        real = replace(MODEL, world_T_base=cell.world_T_base, flange_T_tool=cell.flange_T_body).with_parameters(values)
+        kernel = Kernel(real)
+        T = kernel.frames(kernel.theta0, kernel.poses(plan.q))
+        noise = rng.normal(size=(len(T), 6)) * np.repeat(request.sigma, 3)
+        measured = FrameObservations.isotropic(retract(T, noise), *request.sigma)
+        found = identify(MODEL, kernel.poses(plan.q), [measured], IdentifyOptions(parameters="geometry"))
+        predicted, _ = predict_frames(found, found.kernel.poses(elsewhere))
+        truth = kernel.frames(kernel.theta0, kernel.poses(elsewhere))
+        squares += [np.sum((transform(predicted, p) - transform(truth, p)) ** 2, axis=1) for p in points]
+    reached = np.sqrt(np.mean(squares))
+    assert reached == pytest.approx(plan.predicted[0], rel=0.2)
