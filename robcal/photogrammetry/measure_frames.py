@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy import stats
@@ -24,6 +24,7 @@ from robcal.photogrammetry.unknown_body import body_from_points
 from robcal.transforms import Array
 
 _SPREAD = 0.02
+_MISFIT = "lengths agree but the body does not fit"
 _TOO_MANY = 0.3
 """Where more than this share of the poses violate a fixed tolerance, the violations are evidence, not blunders."""
 
@@ -148,19 +149,22 @@ def measure_frames(
     table = make_pairs(pose, row, p, C)
     shared = _shared_variance(points, at, table)
     recurring = find_recurring(body, table, pose, row, p, shared)
-    judged, factor, poses_with, note = _judge(body, table, recurring, shared, tolerance, sigma_factor)
+    judged, factor, note = _judge(body, table, recurring, shared, tolerance, sigma_factor)
     if note:
         notes.append(note)
     left_out = _leave_out(body, recurring, notes)
     keep, rejected_poses, dropped = _eliminate(body, pose, row, table, judged, left_out)
     rejected += dropped
     fit = fit_frames(pose[keep], row[keep], p[keep], C[keep], body, _station(points, at[keep]), points.station_covariance)
-    good = np.ones(len(fit.pose), dtype=bool)
-    for i, q in enumerate(fit.pose):
-        reason = _bad_fit(fit.chi2[i], int(fit.redundancy[i]), fit.covariance[i], factor, tolerance)
-        if reason and not (method == "points" and recurring.pairs):
-            good[i] = False
-            rejected_poses.append(RejectedPose(int(q), reason))
+    reasons = [
+        _bad_fit(fit.chi2[i], int(fit.redundancy[i]), fit.covariance[i], factor) for i in range(len(fit.pose))
+    ]
+    misfits = [r is not None and r.startswith(_MISFIT) for r in reasons]
+    if sum(misfits) > _TOO_MANY * len(reasons):
+        notes.append(f"in {sum(misfits)} of {len(reasons)} poses the body does not fit its points: evidence, not rejected")
+        reasons = [None if bad else r for r, bad in zip(reasons, misfits, strict=True)]
+    good = np.array([r is None for r in reasons], dtype=bool)
+    rejected_poses += [RejectedPose(int(q), r) for q, r in zip(fit.pose, reasons, strict=True) if r is not None]
     out = _assemble(points, fit, good, method, body)
     with_frame = set(out["pose"].tolist())
     rejected_poses = [r for r in rejected_poses if r.pose not in with_frame]
@@ -218,7 +222,7 @@ def _noise_from_lengths(body: Body, pose: IntArray, row: IntArray, p: Array) -> 
 
 def _judge(
     body: Body, table: PairTable, recurring: Recurring, shared: Array, tolerance: float | None, sigma_factor: float
-) -> tuple[PairDeviations, float, int, str | None]:
+) -> tuple[PairDeviations, float, str | None]:
     """Deviation, standard deviation and tolerance of every pair; the noise factor; what a fixed tolerance would do."""
     a, b = table.a, table.b
     file = np.linalg.norm(body.points[b] - body.points[a], axis=1)
@@ -245,7 +249,7 @@ def _judge(
     pairs = PairDeviations(
         table.pose, body.ids[a], body.ids[b], table.distance, file, expected, sigma, limit, np.abs(off) <= limit
     )
-    return pairs, factor, len(violating), note
+    return pairs, factor, note
 
 
 def _leave_out(body: Body, recurring: Recurring, notes: list[str]) -> tuple[int, ...]:
@@ -318,12 +322,12 @@ def _groups(keys: IntArray, order: IntArray) -> dict[int, IntArray]:
     return {int(keys[g[0]]): g for g in np.split(order, cuts)}
 
 
-def _bad_fit(chi2: float, redundancy: int, covariance: Array, factor: float, tolerance: float | None) -> str | None:
+def _bad_fit(chi2: float, redundancy: int, covariance: Array, factor: float) -> str | None:
     """Why a fit is not to be trusted although its lengths are (a mirrored or wrongly numbered body)."""
     if not np.isfinite(covariance).all() or np.sqrt(np.trace(covariance[3:, 3:])) > 0.2:
         return "the targets measured do not determine the orientation of the body"
-    if redundancy > 0 and stats.chi2.sf(chi2 / max(factor, 1.0) ** 2, redundancy) < 1e-12 and tolerance is None:
-        return f"lengths agree but the body does not fit (chi-square {chi2:.0f} with {redundancy}): mirrored or misnumbered"
+    if redundancy > 0 and stats.chi2.sf(chi2 / max(factor, 1.0) ** 2, redundancy) < 1e-12:
+        return f"{_MISFIT} (chi-square {chi2:.0f} with {redundancy}): mirrored or misnumbered targets"
     return None
 
 
@@ -350,5 +354,3 @@ def _assemble(points: MeasuredPoints, fit, good: Array, method: str, body: Body)
         "chi2": chi2[order], "redundancy": redundancy[order],
     }  # fmt: skip
 
-
-__all__ = ["MeasuredFrames", "PairDeviations", "RejectedPose", "measure_frames", "replace"]

@@ -15,9 +15,9 @@ from robcal.photogrammetry.grouping import sum_by
 from robcal.photogrammetry.intersection import intersect
 from robcal.photogrammetry.measured_points import MeasuredPoints, RejectedPoint, ResectedPoses
 from robcal.photogrammetry.resection import Resection, refine_poses, resect_images
-from robcal.photogrammetry.station_adjustment import linearise
+from robcal.photogrammetry.station_adjustment import interior_basis, linearise
 from robcal.photogrammetry.station_network import MarkTable, StationMarks, StationOrientation, Unknowns
-from robcal.transforms import Array, fit_frame, invert, skew, transform
+from robcal.transforms import Array, invert, skew, transform
 
 _SPREAD = 0.02
 """Targets whose spread across their line is below this share do not carry a frame."""
@@ -47,6 +47,7 @@ def measure_points(
     carried = orientation.body if body is None else body
     table, number, noise = _table(orientation, marks, carried)
     rejected: list[RejectedPoint] = []
+    suspect = {r.pose for r in orientation.rejected if r.kind == "contradiction"}
     if len(table.camera) == 0:
         raise DegenerateGeometry("the cameras of the station have no usable marks")
     poses, pose_row = np.unique(number, return_inverse=True)
@@ -73,7 +74,7 @@ def measure_points(
         )  # fmt: skip
         pose_of = poses[sub_keys // (len(carried) + 1)]
         target_of = carried.ids[sub_keys % (len(carried) + 1)]
-        keep, inconsistent = _consistent(out.chi2, out.n_cameras, out.p_world, pose_of, target_of, critical, rejected)
+        keep, inconsistent = _consistent(out.chi2, out.n_cameras, out.p_world, pose_of, target_of, critical, rejected, suspect)
         redundancy = 2 * out.n_cameras - 3
         res = np.sqrt(np.maximum(out.chi2, 0) / np.maximum(redundancy, 1))[keep]
         J = np.concatenate(
@@ -88,8 +89,7 @@ def measure_points(
     resected = None
     if resection:
         weak = _weak_poses(poses, pose_of, target_of, carried)
-        banned = {r.pose for r in orientation.rejected if r.kind == "contradiction"}
-        weak = np.array([q for q in weak if q not in banned], dtype=np.int64)
+        weak = np.array([q for q in weak if q not in suspect], dtype=np.int64)
         resected = _resect_poses(orientation, table, number, noise, weak, carried, rejected)
     if resected is not None and len(resected.pose):
         drop = np.isin(pose_of, resected.pose)
@@ -113,7 +113,6 @@ def _table(
 ) -> tuple[MarkTable, IntArray, Array]:
     """All marks not left out by the orientation: table (pose unused), pose numbers, variance factor per mark."""
     banned = {(r.camera, r.pose, r.target) for r in orientation.rejected if r.kind == "outlier"}
-    images = {(r.camera, r.pose) for r in orientation.rejected if r.kind == "contradiction"}
     radius, normals = 0.5 * body.diameters, body.estimated_normals()
     columns: list[tuple[Array, ...]] = []
     for c, name in enumerate(orientation.names):
@@ -122,10 +121,10 @@ def _table(
             continue
         target = body.index(m.target)
         keep = target >= 0
-        if banned or images:
+        if banned:
             keep &= np.array(
                 [
-                    (name, int(p), int(t)) not in banned and (name, int(p)) not in images
+                    (name, int(p), int(t)) not in banned
                     for p, t in zip(m.pose, m.target, strict=True)
                 ]
             )
@@ -175,9 +174,10 @@ def _centred(
 
 def _consistent(
     chi2: Array, n_cameras: IntArray, p: Array, pose: IntArray, target: IntArray, critical: float,
-    rejected: list[RejectedPoint],
+    rejected: list[RejectedPoint], suspect: set[int],
 ) -> tuple[Array, tuple[int, ...]]:  # fmt: skip
-    """Points whose rays agree. Where most points of a pose fail it is not the points: they stay, the pose is named."""
+    """Points whose rays agree. Where most points of a pose fail it is not the points: they stay, the pose is named;
+    but in a ``suspect`` pose, whose images the orientation found to contradict one another, they go."""
     level = 2 * stats.norm.sf(critical)
     finite = np.isfinite(p).all(axis=1)
     limit = stats.chi2.isf(level, np.maximum(2 * n_cameras - 3, 1))
@@ -185,7 +185,7 @@ def _consistent(
     inconsistent = []
     for q in np.unique(pose[fails]):
         rows = pose == q
-        if fails[rows].sum() > 0.5 * rows.sum() and rows.sum() >= 3:
+        if fails[rows].sum() > 0.5 * rows.sum() and rows.sum() >= 3 and int(q) not in suspect:
             inconsistent.append(int(q))
             fails[rows] = False
     for i in np.flatnonzero(fails | ~finite):
@@ -230,14 +230,13 @@ def _resect_poses(
             camera, image.astype(np.int64), body.ids[table.target[mine]], table.xy[mine], scaled[mine], body
         )
         for q, fit in zip(seen, fits, strict=True):
-            if isinstance(fit, Resection) and fit.redundancy > 0:
+            if isinstance(fit, Resection):
                 e = orientation.exterior_of(c, [q])[0]
                 for T in (fit.camera_T_body, fit.alternative):
                     if T is not None:
                         starts.append((int(q), orientation.world_T_exterior[e] @ T))
             else:
-                reason = str(fit) if not isinstance(fit, Resection) else "three targets in one camera: not verifiable"
-                rejected.append(RejectedPoint(int(q), -1, f"camera {orientation.names[c]}: {reason}"))
+                rejected.append(RejectedPoint(int(q), -1, f"camera {orientation.names[c]}: {fit}"))
     if not starts:
         return None
     fit, which, tile = _fit_all(orientation, table, scaled, number, rows, starts, body)
@@ -253,7 +252,9 @@ def _resect_poses(
             k for k in candidates[1:]
             if np.trace(fit.reference_T_body[k][:3, :3].T @ fit.reference_T_body[best][:3, :3]) < 3 - 1e-4
         ]  # fmt: skip
-        if redundancy > 0 and stats.chi2.sf(fit.cost[best], redundancy) < 1e-9:
+        if redundancy <= 0:
+            rejected.append(RejectedPoint(int(q), -1, "resection: three marks alone cannot be verified"))
+        elif stats.chi2.sf(fit.cost[best], redundancy) < 1e-9:
             rejected.append(RejectedPoint(int(q), -1, "resection: the marks do not fit the body"))
         elif distinct and fit.cost[distinct[0]] < fit.cost[best] + 14 * variance:
             rejected.append(
@@ -304,21 +305,21 @@ def _common_covariance(
     B = np.nan_to_num(lin.by_pose)
     N = sum_by(which, np.swapaxes(B, -1, -2) @ B, k)
     pull = np.swapaxes(B, -1, -2)
-    from robcal.photogrammetry.station_adjustment import interior_basis
-
     by_numbers = np.nan_to_num(lin.by_interior) @ np.linalg.inv(interior_basis(interior))[marks.camera]
-    G = np.concatenate(
-        [
-            np.moveaxis(sum_by(which * e + marks.exterior, pull @ np.nan_to_num(lin.by_exterior), k * e).reshape(k, e, 6, 6), 1, 2).reshape(k, 6, 6 * e),
-            np.moveaxis(sum_by(which * c + marks.camera, pull @ by_numbers, k * c).reshape(k, c, 6, 9), 1, 2).reshape(k, 6, 9 * c),
-        ],
-        axis=-1,
+    pinv = np.linalg.pinv(N, hermitian=True)
+
+    def gathered(owner: IntArray, count: int, blocks: Array) -> Array:
+        """(k, 6, count * width) sums of pull @ blocks, one column block per owner."""
+        width = blocks.shape[-1]
+        total = sum_by(which * count + owner, pull @ np.nan_to_num(blocks), k * count)
+        return np.moveaxis(total.reshape(k, count, 6, width), 1, 2).reshape(k, 6, count * width)
+
+    K = -pinv @ np.concatenate(
+        [gathered(marks.exterior, e, lin.by_exterior), gathered(marks.camera, c, by_numbers)], axis=-1
     )
-    K = -np.linalg.pinv(N, hermitian=True) @ G
     out = K @ orientation.covariance @ np.swapaxes(K, -1, -2)
     if body.covariance is not None:
-        H = np.moveaxis(sum_by(which * t + marks.target, pull @ np.nan_to_num(lin.by_point), k * t).reshape(k, t, 6, 3), 1, 2).reshape(k, 6, 3 * t)
-        L = -np.linalg.pinv(N, hermitian=True) @ H
+        L = -pinv @ gathered(marks.target, t, lin.by_point)
         out = out + L @ np.nan_to_num(body.covariance) @ np.swapaxes(L, -1, -2)
     return out
 
@@ -334,8 +335,3 @@ def _points_of_resection(resected: ResectedPoses, body: Body) -> tuple[IntArray,
     J = np.concatenate([R, -R @ skew(X)], axis=-1)
     covariance = J @ resected.covariance[row] @ np.swapaxes(J, -1, -2)
     return pose, target, transform(T, X), covariance, np.ones(len(pose), dtype=np.int64)
-
-
-def fit_start(p_world: Array, p_body: Array) -> Array:
-    """Least-squares frame world_T_body as a start value (isotropic weights)."""
-    return fit_frame(p_world, p_body)

@@ -125,8 +125,6 @@ def find_recurring(
     noise = np.sum(sigma[a] ** 2 + sigma[b] ** 2, axis=1) / 3
     s = np.sqrt(noise + shared + body_pair_variance(body.points, body.covariance, a, b))
     deviation = d_mean - d_file
-    if not np.any(np.abs(deviation) > _SIGNIFICANT * s):
-        return none
     scale, scale_sigma = _common_scale(deviation, d_file, s)
     left = deviation - scale * d_file
     if not (
@@ -147,18 +145,43 @@ def find_recurring(
         badness[at[int(i)], at[int(j)]] = badness[at[int(j)], at[int(i)]] = (x / y) ** 2
     violated = [(at[int(i)], at[int(j)]) for i, j in zip(a[bad], b[bad], strict=True)]
     removed = culprits(len(seen), violated, badness)
-    targets: tuple[TargetShift, ...] = ()
     unexplained = tuple(
         f for f, i, j in ((f, at[int(body.index([f.first])[0])], at[int(body.index([f.second])[0])]) for f in found)
         if removed is None and (i, j) in violated
     )  # fmt: skip
-    if removed:
-        stay = np.array([int(i) for i in seen if at[int(i)] not in removed])
-        targets = _shifts(body, mean, sigma, stay, [int(seen[k]) for k in sorted(removed)], 1.0 + scale)
+    stay = np.array([int(i) for i in seen if at[int(i)] not in (removed or set())])
+    stay = _off_the_plane(body, mean, sigma, stay, 1.0 + scale, float(np.median(shared)))
+    gone = [int(i) for i in seen if i not in stay]
+    targets = _shifts(body, mean, sigma, stay, gone, 1.0 + scale) if gone and removed is not None else ()
     return Recurring(
         tuple(found), targets, 1e6 * scale if scale else None, 1e6 * scale_sigma if scale else None, unexplained, mean,
         _statement(body, targets, scale, unexplained),
     )  # fmt: skip
+
+
+def _off_the_plane(
+    body: Body, mean: Array, sigma: Array, stay: IntArray, scale: float, shared: float
+) -> IntArray:
+    """Targets that stay after those are taken away whose place in space is off although their distances are not.
+
+    A shift across a plane changes distances only to second order. Each target is compared with the others' fit.
+    """
+    stay = stay.copy()
+    while len(stay) >= 5:
+        worst, which = 0.0, -1
+        for i in stay:
+            others = stay[stay != i]
+            if line_ratio(body.points[others]) < 0.02:
+                continue
+            moved = transform(fit_frame(body.points[others], mean[others] / scale), mean[i] / scale)
+            C = np.diag(sigma[i] ** 2 + np.mean(sigma[others] ** 2, axis=0)) + 2 * body.marginal(i) + shared * np.eye(3)
+            size = float((moved - body.points[i]) @ np.linalg.solve(C, moved - body.points[i]))
+            if size > worst:
+                worst, which = size, int(i)
+        if worst < _SIGNIFICANT**2 + 3 * len(stay):
+            break
+        stay = stay[stay != which]
+    return stay
 
 
 def _common_scale(deviation: Array, length: Array, sigma: Array) -> tuple[float, float]:

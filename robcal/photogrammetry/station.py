@@ -20,7 +20,15 @@ from robcal.photogrammetry.station_network import (
     StationOrientation,
     StationSettings,
 )
-from robcal.photogrammetry.station_start import connect_cameras, focal_start, resect_station, start_bodies
+from robcal.photogrammetry.station_start import (
+    ImageStart,
+    connect_cameras,
+    exchanged,
+    find_swap,
+    focal_start,
+    resect_station,
+    start_bodies,
+)
 from robcal.photogrammetry.station_state import StationState, assemble
 from robcal.transforms import Array
 
@@ -71,6 +79,12 @@ def orient_station(
     if not images:
         reason = failed[0][2] if failed else "no marks"
         raise DegenerateGeometry(f"no image of the station carries a pose of body {body.name}: {reason}")
+    evidence: list[Evidence] = []
+    swap = find_swap(marks, start, body, options.default_sigma_px, images)
+    if swap is not None:
+        evidence.append(_swap_evidence(body, *swap))
+        body = exchanged(body, *swap)
+        images, failed = resect_station(names, marks, start, body, options.default_sigma_px)
     exterior, fixed, contradicting = connect_cameras(names, images, stated)
     bad = set(contradicting)
     rejected = [
@@ -79,6 +93,7 @@ def orient_station(
     ]
     rejected += [RejectedMark(names[c], p, -1, reason, "no_pose") for c, p, reason in failed]
     good = [s for s in images if (s.camera, s.pose) not in bad]
+    rejected += _left_out_by_resection(names, marks, good)
     if not good:
         raise DegenerateGeometry("the cameras contradict one another in every pose: images and poses do not belong together")
     bodies = start_bodies(good, marks, start, exterior, body, options.default_sigma_px)
@@ -89,8 +104,42 @@ def orient_station(
     cleaned = resolve_contradictions(state, state.robust_adjustment())
     drop_insignificant(state, cleaned.adjusted)
     adjusted, outliers = snoop(state)
-    evidence = cleaned.evidence + _lens_evidence(state, adjusted, cameras)
-    return _result(state, adjusted, tuple(sorted(ambiguous)), evidence, (*rejected, *cleaned.rejected, *outliers))
+    evidence += [*cleaned.evidence, *_lens_evidence(state, adjusted, cameras)]
+    left = _tell_recurring([*rejected, *cleaned.rejected, *outliers], marks)
+    return _result(state, adjusted, tuple(sorted(ambiguous)), tuple(evidence), left)
+
+
+def _swap_evidence(body: Body, i: int, j: int) -> Evidence:
+    a, b = int(body.ids[i]), int(body.ids[j])
+    text = f"targets {a} and {b} of body {body.name} are swapped: with exchanged coordinates the images fit"
+    shift = body.points[j] - body.points[i]
+    return Evidence("target_swapped", f"{a},{b}", None, shift, np.zeros((3, 3)), float("inf"), 3, text)
+
+
+def _left_out_by_resection(
+    names: tuple[str, ...], marks: list[StationMarks], images: list[ImageStart]
+) -> list[RejectedMark]:
+    """Marks that the pose of their own image leaves far off."""
+    out = []
+    for s in images:
+        m = marks[s.camera]
+        for i in np.setdiff1d(np.flatnonzero(m.pose == s.pose), s.rows):
+            out.append(RejectedMark(names[s.camera], s.pose, int(m.target[i]), "far from where its image's pose puts it"))
+    return out
+
+
+def _tell_recurring(rejected: list[RejectedMark], marks: list[StationMarks]) -> tuple[RejectedMark, ...]:
+    """Where most marks of a target were left out it is the target, not the marks: they keep being measured."""
+    seen: dict[int, int] = {}
+    for m in marks:
+        for t, n in zip(*np.unique(m.target, return_counts=True), strict=True):
+            seen[int(t)] = seen.get(int(t), 0) + int(n)
+    gone: dict[int, int] = {}
+    for r in rejected:
+        if r.kind == "outlier":
+            gone[r.target] = gone.get(r.target, 0) + 1
+    often = {t for t, n in gone.items() if n > 0.5 * seen.get(t, 1) and n >= 5}
+    return tuple(replace(r, kind="recurring") if r.kind == "outlier" and r.target in often else r for r in rejected)
 
 
 def _usable(name: str, marks: StationMarks, body: Body) -> StationMarks:

@@ -113,15 +113,16 @@ def _worst_target(state: StationState, adjusted: Adjusted) -> Evidence | None:
         return None
     t = len(state.body)
     Q = adjusted.design.reduced_inverse[-3 * t :, -3 * t :]
-    stat, error, covariance = scan_targets(state.unknowns.points, state.prior.points, state.prior.points_weight, Q)
     usable = seen[~free]
-    typical = float(np.median(stat[usable])) / stats.chi2.median(3)
-    i = int(usable[np.argmax(stat[usable])])
-    if stat[i] < _TARGET_LIMIT * max(1.0, typical):
+    scan = scan_targets(state.unknowns.points, state.prior.points, state.prior.points_weight, Q, usable)
+    i = int(usable[np.argmax(scan.statistic[usable])])
+    if scan.statistic[i] < _TARGET_LIMIT * max(1.0, scan.rest[i] / float(stats.chi2.median(3))):
         return None
     ident = int(state.body.ids[i])
-    text = f"target {ident} of body {state.body.name} is {1e3 * np.linalg.norm(error[i]):.3g} mm from where its file says"
-    return Evidence("target_shifted", str(ident), None, error[i], covariance[i], float(stat[i]), 3, text)
+    text = f"target {ident} of body {state.body.name} is {1e3 * np.linalg.norm(scan.error[i]):.3g} mm from where its file says"
+    return Evidence(
+        "target_shifted", str(ident), None, scan.error[i], scan.covariance[i], float(scan.statistic[i]), 3, text
+    )
 
 
 def drop_insignificant(state: StationState, adjusted: Adjusted) -> Adjusted:

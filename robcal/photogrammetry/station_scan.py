@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import linalg
 
 from robcal.photogrammetry.bodies import IntArray
 from robcal.photogrammetry.grouping import sum_by
@@ -90,34 +89,59 @@ def _statistics(
     return stat, estimate, covariance / (scale[..., :, None] * scale[..., None, :])
 
 
-def scan_targets(
-    points: Array, given: Array, weight: Array, covariance: Array
-) -> tuple[Array, Array, Array]:
+@dataclass(frozen=True)
+class TargetScan:
+    """Tests of given coordinates: ``statistic`` (t,) chi-square (3), ``error`` (t, 3) true minus given with
+    ``covariance`` (t, 3, 3), and ``rest`` (t,) the median statistic of the other targets once this one is freed."""
+
+    statistic: Array
+    error: Array
+    covariance: Array
+    rest: Array
+
+
+def scan_targets(points: Array, given: Array, weight: Array, covariance: Array, usable: IntArray) -> TargetScan:
     """Test every target for a gross error of its given coordinates.
 
     Parameters
     ----------
     points, given : (t, 3) adjusted and given coordinates; weight (3t, 3t) of the given; covariance (3t, 3t) adjusted.
+    usable : rows of the targets to test.
 
-    Returns
-    -------
-    statistic (t,) chi-square with three degrees of freedom, estimated error true minus given (t, 3), its covariance
-    (t, 3, 3). Source: Baarda's test for a group of observations, ``nabla = (E'P Qv P E)^-1 E'P v``.
+    Notes
+    -----
+    Baarda's test for a group of observations, ``nabla = (E'P Qv P E)^-1 E'P v`` with ``P Qv P = P - P Q P``. ``rest``
+    tells a wrong target, after which the others fit, from a body that is inaccurate as a whole.
     """
     t = len(points)
-    v = (given - points).ravel()
-    pull = (weight @ v).reshape(t, 3)
-    # P Qv P = P - P Q P
+    pull = weight @ (given - points).ravel()
     S = weight - weight @ covariance @ weight
-    stat, error, cov = np.zeros(t), np.zeros((t, 3)), np.zeros((t, 3, 3))
-    for i in range(t):
-        block = S[3 * i : 3 * i + 3, 3 * i : 3 * i + 3]
-        own = weight[3 * i : 3 * i + 3, 3 * i : 3 * i + 3]
-        values, vectors = linalg.eigh(0.5 * (block + block.T))
-        good = values > 1e-9 * np.trace(own)
-        inverse = np.where(good, 1.0 / np.where(good, values, 1.0), 0.0)
-        along = vectors.T @ pull[i]
-        stat[i] = float(np.sum(along**2 * inverse))
-        cov[i] = (vectors * inverse) @ vectors.T
-        error[i] = -cov[i] @ pull[i]
-    return stat, error, cov
+    S = 0.5 * (S + S.T)
+    floor = 1e-9 * np.array([np.trace(weight[3 * i : 3 * i + 3, 3 * i : 3 * i + 3]) for i in range(t)])
+    scan = TargetScan(np.zeros(t), np.zeros((t, 3)), np.zeros((t, 3, 3)), np.zeros(t))
+    blocks = 3 * usable[:, None] + np.arange(3)
+    for i, at in zip(usable, blocks, strict=True):
+        inverse = _pseudo_inverse(S[np.ix_(at, at)][None], floor[i])[0]
+        scan.statistic[i] = float(pull[at] @ inverse @ pull[at])
+        scan.covariance[i] = inverse
+        scan.error[i] = -inverse @ pull[at]
+        others = blocks[usable != i]
+        if len(others) == 0:
+            continue
+        gain = S[:, at] @ inverse
+        left = (pull - gain @ pull[at])[others]
+        cross = S[at][:, others]
+        conditional = S[others[:, :, None], others[:, None, :]] - np.einsum(
+            "jka,ajl->jkl", gain[others], cross
+        )
+        inner = _pseudo_inverse(conditional, np.median(floor[usable]))
+        scan.rest[i] = float(np.median(np.einsum("ji,jik,jk->j", left, inner, left)))
+    return scan
+
+
+def _pseudo_inverse(blocks: Array, floor: float) -> Array:
+    """Inverse (n, 3, 3) of symmetric blocks, directions with eigenvalues below ``floor`` left out."""
+    values, vectors = np.linalg.eigh(0.5 * (blocks + np.swapaxes(blocks, -1, -2)))
+    good = values > floor
+    inverse = np.where(good, 1.0 / np.where(good, values, 1.0), 0.0)
+    return np.einsum("nij,nj,nkj->nik", vectors, inverse, vectors)

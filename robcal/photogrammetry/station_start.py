@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 
@@ -88,6 +89,48 @@ def resect_station(
     return starts, failed
 
 
+def find_swap(
+    marks: Sequence[StationMarks], cameras: Sequence[Camera], body: Body, sigma_px: float, images: Sequence[ImageStart]
+) -> tuple[int, int] | None:
+    """Two targets (body rows) whose exchange makes the images fit that do not fit as they are; None without need.
+
+    Only small bodies (up to 12 targets) need this: in larger ones a resection leaves both out and the exchange shows in
+    the measured points.
+    """
+    known = np.flatnonzero(body.known)
+    if not 4 <= len(known) <= 12:
+        return None
+    richest = sorted(images, key=lambda s: -len(s.rows))[:8]
+    if not richest or np.median([s.resection.chi2 / max(1, s.resection.redundancy) for s in richest]) < 25.0:
+        return None
+
+    def misfit(trial: Body) -> float:
+        values = []
+        for s in richest:
+            m = marks[s.camera]
+            rows = np.flatnonzero(m.pose == s.pose)
+            fit = resect_images(
+                cameras[s.camera], np.zeros(len(rows), dtype=np.int64), m.target[rows], m.xy[rows], m.covariance[rows],
+                trial, gate=1e6, model_error_px=sigma_px,
+            )[0]  # fmt: skip
+            values.append(fit.chi2 / max(1, fit.redundancy) if isinstance(fit, Resection) else 1e12)
+        return float(np.median(values))
+
+    before = misfit(body)
+    trials = [(misfit(exchanged(body, int(i), int(j))), int(i), int(j)) for i, j in combinations(known, 2)]
+    after, i, j = min(trials)
+    return (i, j) if after < 4.0 and after < 0.02 * before else None
+
+
+def exchanged(body: Body, i: int, j: int) -> Body:
+    """The body with the coordinates of two rows exchanged (and their covariances)."""
+    order = np.arange(len(body))
+    order[[i, j]] = order[[j, i]]
+    columns = (3 * order[:, None] + np.arange(3)).ravel()
+    covariance = None if body.covariance is None else body.covariance[np.ix_(columns, columns)]
+    return replace(body, points=body.points[order], covariance=covariance)
+
+
 def vote_relative(first: Sequence[Sequence[Array]], second: Sequence[Sequence[Array]]) -> tuple[Array, Array]:
     """Relative orientation a_T_b that most common poses agree with, among all candidates of both cameras.
 
@@ -157,6 +200,8 @@ def connect_cameras(
             if not common:
                 continue
             a_T_b, support = vote_relative([by_camera[a][p] for p in common], [by_camera[b][p] for p in common])
+            if len(common) >= 5 and support.sum() < 0.4 * len(common):
+                _refuse_slipped(names[a], names[b], by_camera[a], by_camera[b], int((support > 0.1).sum()), len(common))
             edges.append((float(support.sum()), a, b, a_T_b))
             for p, s in zip(common, support, strict=True):
                 tally = against if s < 0.01 and len(common) > 2 else for_it
@@ -194,6 +239,27 @@ def connect_cameras(
             root = roots[0]
     bad = [key for key, n in against.items() if n > for_it.get(key, 0)]
     return out, fixed, bad
+
+
+def _refuse_slipped(
+    first: str, second: str, a: Mapping[int, tuple[Array, ...]], b: Mapping[int, tuple[Array, ...]], agree: int, n: int
+) -> None:
+    """Say that two cameras do not see the same poses, and whether a shift of the numbering would mend it."""
+    for shift in (1, -1, 2, -2, 3, -3):
+        common = sorted(p for p in a if p + shift in b)
+        if len(common) < 5:
+            continue
+        support = vote_relative([a[p] for p in common], [b[p + shift] for p in common])[1]
+        if support.sum() > 0.7 * len(common):
+            raise InvalidInput(
+                f"the images of camera {second} are slipped by {abs(shift)} against those of {first} (what {first} shows in "
+                f"a pose, {second} shows {abs(shift)} {'later' if shift > 0 else 'earlier'}; so they agree in "
+                f"{int((support > 0.1).sum())} of {len(common)} poses): rename them"
+            )
+    raise InvalidInput(
+        f"cameras {first} and {second} agree on one relative orientation in only {agree} of {n} common poses: a camera "
+        "moved between poses, images do not belong to these poses, or the targets are misnumbered"
+    )
 
 
 def start_bodies(
