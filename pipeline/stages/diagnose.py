@@ -11,13 +11,14 @@ import numpy as np
 from pipeline.bodies import body_for_robot
 from pipeline.calibrated import Calibrated
 from pipeline.campaign import Campaign
+from pipeline.image_findings import images_of
 from pipeline.poses_table import Poses
 from pipeline.runs import write_json
 from pipeline.stages.base import Context, Outcome, Stage, no_files
 from pipeline.stages.identify import load_identification, require_robot
 from pipeline.stages.observations import RobotRecording, Rows
 from pipeline.tables import write_table
-from robcal.diagnosis.contract import as_contract
+from robcal.diagnosis.contract import as_contract, with_images
 from robcal.diagnosis.diagnose import diagnose
 from robcal.diagnosis.recording import Accepted, Recording, fit
 from robcal.diagnosis.result import Diagnosis
@@ -50,8 +51,16 @@ def recording_for_diagnosis(
 
 
 def work(context: Context) -> Outcome:
-    """Diagnose the identified robot; verification poses only measure the gain."""
+    """Diagnose the images, then the identified robot; verification poses only measure the gain."""
     campaign, run = context.campaign, context.run
+    images = images_of(campaign, run)
+    if campaign.robot is None or campaign.poses is None:
+        content = with_images(None, images.findings, images.scans, images.noise)
+        write_json(run.diagnosis, content)
+        told = [str(finding.statement) for finding in images.findings] or [str(content["statement"])]
+        causes = [{"cause": f.cause, "where": f.where, "direction": f.direction} for f in images.findings]
+        result = {"mismatch": content["mismatch"], "p_value": content["p_value"], "causes": causes}
+        return Outcome({"diagnosis": result | {"heldout_px": content["heldout_px"]}}, [run.diagnosis], told)
     _, poses = require_robot(campaign)
     identification = load_identification(run)
     found, measured = identification.robot(), identification.recording
@@ -72,7 +81,7 @@ def work(context: Context) -> Outcome:
         context.messages.info,
     )
     outputs = [run.diagnosis]
-    content = as_contract(diagnosis)
+    content = with_images(as_contract(diagnosis), images.findings, images.scans, images.noise)
     write_json(run.diagnosis, content)
     table = content.get("next_poses")
     if table:
@@ -89,7 +98,8 @@ def work(context: Context) -> Outcome:
             diagnosed=True,
         )
     outputs.append(run.save(f"calibrated_{NAME}", calibrated))
-    notes = [finding.statement for finding in diagnosis.findings] or ["nothing missing: the model explains the data"]
+    told = [*images.findings, *diagnosis.findings]
+    notes = [finding.statement for finding in told] or ["nothing missing: the model explains the data"]
     return Outcome({"diagnosis": _result(diagnosis)}, outputs, notes)
 
 
@@ -132,11 +142,10 @@ def _result(diagnosis: Diagnosis) -> dict[str, Any]:
 
 STAGE = Stage(
     name=NAME,
-    applies=lambda campaign: campaign.robot is not None and campaign.poses is not None
-    and campaign.entry.diagnosis.enabled,
+    applies=lambda campaign: campaign.entry.diagnosis.enabled,
     work=work,
     inputs=no_files,
     settings=lambda campaign: campaign.entry.diagnosis.model_dump(),
-    after=("identify",),
-    code=("robcal/diagnosis", "robcal/physics", "pipeline/stages/diagnose.py"),
+    after=("survey", "orient", "identify"),
+    code=("robcal/diagnosis", "robcal/physics", "pipeline/stages/diagnose.py", "pipeline/image_findings.py"),
 )

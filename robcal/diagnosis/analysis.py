@@ -94,7 +94,7 @@ def _look(
     stacks = stack_entries(listed, basis)
     result = scan(stacks, residual, redundancy)
     ranked = posterior(families, result)
-    family_wise = level if level is not None else simulate(stacks, basis, redundancy, runs=runs)
+    family_wise = level if level is not None else simulate(stacks, basis, redundancy, len(residual), runs=runs)
     p_value = family_wise.probability(float(result.log_p[result.best]))
     named = np.array([family.cause != "unknown" for family in families])
     suspect = worst_group(residual, basis, recording.row_groups(len(residual)))

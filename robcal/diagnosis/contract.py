@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
+from robcal.diagnosis.image_diagnosis import ImageDiagnosis, ImageFinding
 from robcal.diagnosis.next_poses import poses_table
 from robcal.diagnosis.result import Diagnosis, Finding
 
@@ -58,6 +60,69 @@ def _cause(finding: Finding) -> dict[str, object]:
         "heldout_mm": {"before": number(finding.heldout[0] * 1e3), "after": number(finding.heldout[1] * 1e3)},
         "statement": finding.statement,
     }
+
+
+def image_cause(finding: ImageFinding) -> dict[str, object]:
+    """One cause found in images, in the contract's form."""
+    return {
+        "cause": finding.cause, "stage": finding.stage, "where": finding.where, "direction": finding.direction,
+        "parameters": {name: number(value) for name, value in finding.parameters.items()},
+        "sigma": {name: number(value) for name, value in finding.sigma.items()},
+        "p_value": number(finding.p_value),
+        "indistinguishable_from": [{"cause": cause, "where": where} for cause, where in finding.rivals],
+        "heldout_px": {"before": number(finding.heldout_px[0]), "after": number(finding.heldout_px[1])},
+        "statement": finding.statement,
+    }
+
+
+def with_images(
+    robot: dict[str, object] | None, findings: Sequence[ImageFinding], scans: Sequence[ImageDiagnosis], noise: float,
+) -> dict[str, object]:
+    """The content of diagnosis.json for images alone, or the robot's extended by what the images say first.
+
+    `findings` are in the order in which they were accepted; `scans` the last looks at each set of images; `noise` the
+    factor by which the marks scatter more than stated.
+    """
+    causes = [image_cause(finding) for finding in findings]
+    if robot is not None:
+        if not causes:
+            return robot
+        first = findings[0]
+        statements = ". ".join(finding.statement for finding in findings) + "."
+        text = f"{statements} {robot['statement']}" if robot["mismatch"] else f"{statements} Beyond that nothing is missing."
+        return robot | {
+            "mismatch": True, "p_value": number(min(first.p_value, float(str(robot["p_value"])))), "statement": text,
+            "location": _place(first), "causes": [*causes, *_listed(robot["causes"])],
+        }
+    before = max((finding.heldout_px[0] for finding in findings), default=max((s.heldout_px[0] for s in scans), default=0.0))
+    after = max((scan.heldout_px[1] for scan in scans), default=0.0)
+    floor = max((scan.heldout_px[2] for scan in scans), default=0.0)
+    left = min((scan.unexplained_p for scan in scans), default=1.0)
+    text = ". ".join(finding.statement for finding in findings) + "."
+    return {
+        "format": "robcal/diagnosis-1",
+        "mismatch": bool(findings),
+        "p_value": number(min((f.p_value for f in findings), default=min((s.p_value for s in scans), default=1.0))),
+        "statement": text if findings else "Nothing is missing: the images agree with their model down to their noise.",
+        "location": _place(findings[0]) if findings else None,
+        "causes": causes,
+        "heldout_px": {"before": number(before), "after": number(after), "noise_floor": number(floor)},
+        "noise": {"stated": 1.0, "estimated": number(noise)},
+        "unexplained": {
+            "p_value": number(left), "pattern": None if left > 0.01 else "a smooth field over the image, small against the noise",
+        },
+        "blunders": [],
+        "next_poses": [],
+        "notes": [],
+    }
+
+
+def _place(finding: ImageFinding) -> dict[str, object]:
+    return {"stage": finding.stage, "where": finding.where, "direction": finding.direction, "poses": []}
+
+
+def _listed(causes: object) -> list[object]:
+    return list(causes) if isinstance(causes, list) else []
 
 
 def summary(diagnosis: Diagnosis) -> str:

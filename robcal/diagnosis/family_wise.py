@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from robcal.diagnosis.scan import Stack, log_f_probability
+from robcal.diagnosis.scan import Fitted, Stack, log_f_probability, remove
 from robcal.transforms import Array
 
 
@@ -33,25 +33,25 @@ class FamilyWise:
 
 
 def simulate(
-    stacks: Sequence[Stack], fitted: Array, redundancy: int, *, runs: int = 400, seed: int = 0,
+    stacks: Sequence[Stack], fitted: Fitted, redundancy: int, rows: int, *, runs: int = 400, seed: int = 0,
     residual: Array | None = None, block: Array | None = None,
 ) -> FamilyWise:
     """Simulate the scan's smallest probability under "nothing is missing".
 
     Parameters
     ----------
-    fitted : (m, p) orthonormal basis of the fitted Jacobian.
+    fitted : what the model absorbs. rows : m, number of residuals.
     residual, block : with both given, blocks of the residual keep their values and get random signs; else Gaussian.
     """
     rng = np.random.default_rng(seed)
-    m = fitted.shape[0]
+    m = rows
     if residual is not None and block is not None:
         _, number = np.unique(block, return_inverse=True)
         signs = rng.choice([-1.0, 1.0], size=(int(number.max()) + 1, runs))
         noise = residual[:, None] * signs[number]
     else:
         noise = rng.standard_normal((m, runs))
-    noise -= fitted @ (fitted.T @ noise)
+    noise = remove(fitted, noise)
     total = np.sum(noise**2, axis=0)
     smallest = np.zeros(runs)
     for stack in stacks:

@@ -9,7 +9,7 @@ whose amplitudes have the prior as standard deviation, averaged over three sizes
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -90,8 +90,19 @@ def orthonormal_basis(jacobian: Array) -> Array:
     return U[:, s > 1e-9 * s[0]] if len(s) else U
 
 
-def stack_entries(entries: Sequence[Entry], fitted: Array) -> tuple[Stack, ...]:
-    """Project all entries out of the fitted basis (m, p) and orthonormalise them, grouped by number of columns."""
+Fitted = Array | Callable[[Array], Array]
+"""What a model absorbs: an orthonormal basis (m, p), or a function that removes it from columns (m, k)."""
+
+
+def remove(fitted: Fitted, columns: Array) -> Array:
+    """Columns (m, k) without what the fitted model absorbs."""
+    if callable(fitted):
+        return fitted(columns)
+    return np.asarray(columns - fitted @ (fitted.T @ columns))
+
+
+def stack_entries(entries: Sequence[Entry], fitted: Fitted) -> tuple[Stack, ...]:
+    """Project all entries out of the fitted model and orthonormalise them, grouped by number of columns."""
     stacks = []
     for width in sorted({entry.columns.shape[1] for entry in entries}):
         group = [entry for entry in entries if entry.columns.shape[1] == width]
@@ -99,7 +110,7 @@ def stack_entries(entries: Sequence[Entry], fitted: Array) -> tuple[Stack, ...]:
         m = columns.shape[1]
         flat = columns.transpose(1, 0, 2).reshape(m, -1)
         norms = np.linalg.norm(flat, axis=0)
-        flat = flat - fitted @ (fitted.T @ flat)
+        flat = remove(fitted, flat)
         # a column that vanishes against its own size is rounding noise
         flat[:, np.linalg.norm(flat, axis=0) < 1e-7 * norms] = 0.0
         projected = np.ascontiguousarray(flat.reshape(m, len(group), width).transpose(1, 0, 2))

@@ -1,0 +1,111 @@
+"""What surveys and stations found and corrected by themselves, told as causes: lens groups left out of a camera's file,
+cameras that moved, targets that sit elsewhere."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+from scipy import stats
+
+from robcal.diagnosis.image_diagnosis import ImageFinding
+from robcal.photogrammetry.camera import INTRINSIC_NAMES, Camera
+from robcal.photogrammetry.network import CameraNetwork
+from robcal.photogrammetry.station_network import Evidence, StationOrientation
+from robcal.transforms import Array
+
+LENS_GROUPS: Mapping[str, tuple[str, ...]] = {
+    "lens_radial": ("k1", "k2", "k3"), "lens_tangential": ("p1", "p2"), "lens_affinity": ("fx", "fy"),
+}
+KIND = {"lens_radial": "radial distortion", "lens_tangential": "tangential distortion", "lens_affinity": "affinity"}
+LEVEL = 1e-4
+LEAST_PIXELS = 0.02
+"""Significance and size (root mean square over the image, px) from which a lens group is worth a name."""
+
+
+def survey_findings(network: CameraNetwork, start: Camera | None, name: str) -> tuple[ImageFinding, ...]:
+    """Lens groups that the given camera file has at zero and the self-calibration finds significant.
+
+    Wald test on the adjusted numbers; "before" is the root mean square that the images would have without the group,
+    everything else adjusted anew to first order.
+    """
+    if start is None:
+        return ()
+    found = []
+    rms, marks = network.rms_px, len(network.marks)
+    for cause, group in LENS_GROUPS.items():
+        if cause == "lens_affinity":
+            given, contrast = start.fy - start.fx, _difference()
+        else:
+            given = float(np.abs([getattr(start, n) for n in group]).max())
+            contrast = np.array([[float(n == m) for m in INTRINSIC_NAMES] for n in group if n in network.free_intrinsics])
+        if abs(given) > 1e-9 or not len(contrast):
+            continue
+        values = contrast @ network.camera.vector
+        covariance = contrast @ network.intrinsics_covariance @ contrast.T
+        if not np.all(np.diag(covariance) > 0):
+            continue
+        statistic = float(values @ np.linalg.solve(covariance, values))
+        p_value = float(stats.chi2.sf(statistic, len(values)))
+        before = float(np.sqrt(rms**2 + statistic * network.sigma0_px**2 / (2 * marks)))
+        if p_value > LEVEL or np.sqrt(before**2 - rms**2) < LEAST_PIXELS:
+            continue
+        names = ["fy_minus_fx_px"] if cause == "lens_affinity" else [n for n in group if n in network.free_intrinsics]
+        told = dict(zip(names, map(float, values), strict=True))
+        sigma = dict(zip(names, map(float, np.sqrt(np.diag(covariance))), strict=True))
+        text = f"The lens of camera '{name}' has {KIND[cause]} that its file leaves out"
+        found.append(
+            (statistic, ImageFinding(cause, "camera", name, None, dict(told), dict(sigma), p_value, (), (before, rms), text))
+        )
+    return tuple(finding for _, finding in sorted(found, key=lambda item: -item[0]))
+
+
+def _difference() -> Array:
+    row = np.zeros((1, len(INTRINSIC_NAMES)))
+    row[0, INTRINSIC_NAMES.index("fy")], row[0, INTRINSIC_NAMES.index("fx")] = 1.0, -1.0
+    return row
+
+
+def station_findings(orientation: StationOrientation, pose_names: tuple[str, ...]) -> Iterator[ImageFinding]:
+    """Recurring contradictions that the station's adjustment freed, strongest first."""
+    rms, marks = orientation.rms_px, len(orientation.marks)
+    for item in sorted(orientation.evidence, key=lambda e: -e.statistic):
+        before = float(np.sqrt(rms**2 * (1.0 + item.statistic / (2 * marks))))
+        p_value = float(stats.chi2.sf(item.statistic, item.degrees))
+        told, sigma, stage, text = _told(orientation, item, pose_names)
+        if told is None:
+            continue
+        rivals: tuple[tuple[str, str], ...] = ()
+        if item.kind == "camera_moved" and len(orientation.names) == 2:
+            other = next(name for name in orientation.names if name != item.where)
+            rivals = (("camera_moved", other),)
+        yield ImageFinding(item.kind, stage, item.where, None, told, sigma, p_value, rivals, (before, rms), text)
+
+
+def _told(
+    orientation: StationOrientation, item: Evidence, pose_names: tuple[str, ...]
+) -> tuple[dict[str, object] | None, dict[str, object], str, str]:
+    spread = np.sqrt(np.clip(np.diag(item.covariance), 0.0, None))
+    if item.kind in LENS_GROUPS:
+        camera = orientation.cameras[orientation.names.index(item.where)]
+        if item.kind == "lens_affinity":
+            told: dict[str, object] = {"fy_minus_fx_px": camera.fy - camera.fx}
+        else:
+            told = {name: float(getattr(camera, name)) for name in LENS_GROUPS[item.kind]}
+        text = f"The lens of camera '{item.where}' has {KIND[item.kind]} that its file leaves out"
+        return told, {}, "camera", text
+    if item.kind == "camera_moved" and item.pose is not None:
+        label = pose_names[item.pose]
+        scale = np.r_[np.full(3, 1e3), np.full(3, np.degrees(1.0))]
+        values, sigmas = item.estimate * scale, spread * scale
+        told = {"pose": label, "shift_mm": values[:3].tolist(), "turn_deg": values[3:].tolist()}
+        text = (
+            f"Camera {item.where} moved before pose {label} by {np.linalg.norm(values[:3]):.3f} mm and "
+            f"{np.linalg.norm(values[3:]):.4f} deg"
+        )
+        return told, {"shift_mm": sigmas[:3].tolist(), "turn_deg": sigmas[3:].tolist()}, "camera", text
+    if item.kind == "target_shifted":
+        values = item.estimate * 1e3
+        text = f"Target {item.where} sits {np.linalg.norm(values):.3f} mm from where its file says"
+        return {"shift_mm": values.tolist()}, {"shift_mm": (spread * 1e3).tolist()}, "body", text
+    return None, {}, "camera", ""
