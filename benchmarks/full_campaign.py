@@ -18,12 +18,15 @@ import threading
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import yaml
 
 from fixtures.campaign_writer import write_image_campaign
 from fixtures.image_campaign import full_campaign
-from fixtures.rigid import best_frame, frame_from_six, move
+from fixtures.rigid import best_frame, move
+from fixtures.viewing import frame_from_numbers
 
 
 @dataclass
@@ -100,11 +103,12 @@ def run_pipeline(campaign: Path, run: Path) -> tuple[float, float]:
 def prediction_errors(folder: Path, run: Path, scratch: Path) -> tuple[np.ndarray, np.ndarray]:
     """Distances (mm) of predicted and true tool origin at unmeasured poses, as stated and after aligning the worlds.
 
-    The world is the first camera's frame as it was estimated; its small turn against the true one is no error of the
-    robot's model.
+    The tool is the body's frame as surveyed, fitted onto the coordinates in its file; the truth is brought to it by the
+    codes. The world is the first camera's frame as it was estimated; its small turn against the true one is no error of
+    the robot's model.
     """
-    truth = json.loads((folder / "truth" / "truth.json").read_text())["predict"]
-    q = np.array(truth["q_deg"])
+    truth = json.loads((folder / "truth" / "truth.json").read_text())
+    q = np.array(truth["predict"]["q_deg"])
     with (scratch / "poses.csv").open("w", newline="") as stream:
         table = csv.writer(stream)
         table.writerow(["pose", *(f"q{k + 1}_deg" for k in range(q.shape[1]))])
@@ -113,13 +117,23 @@ def prediction_errors(folder: Path, run: Path, scratch: Path) -> tuple[np.ndarra
     command = [sys.executable, "-m", "pipeline.cli", "predict", str(run), "--poses", str(scratch / "poses.csv")]
     subprocess.run([*command, "--out", str(out)], check=True, stdout=subprocess.DEVNULL)
     with out.open() as stream:
-        rows = list(csv.DictReader(stream))
-    predicted = np.array([[float(r[f"{a}_mm"]) for a in "xyz"] for r in rows]) / 1e3
-    frames = [frame_from_six([*(v / 1e3 for v in f["xyz_mm"]), *np.radians(f["rpy_deg"])]) for f in truth["frames"]]
+        predicted = np.array([[float(r[f"{a}_mm"]) for a in "xyz"] for r in csv.DictReader(stream)]) / 1e3
+    true_T_surveyed = _body_alignment(truth["bodies"]["plate"], run / "bodies" / "plate.yaml")
+    frames = [frame_from_numbers(f) @ true_T_surveyed for f in truth["predict"]["frames"]]
     true = np.array([f[:3, 3] for f in frames])
-    direct = np.linalg.norm(predicted - true, axis=1)
     placed = move(best_frame(predicted, true[None])[0], predicted)
-    return 1e3 * direct, 1e3 * np.linalg.norm(placed - true, axis=1)
+    return 1e3 * np.linalg.norm(predicted - true, axis=1), 1e3 * np.linalg.norm(placed - true, axis=1)
+
+
+def _body_alignment(true_body: dict[str, Any], surveyed: Path) -> np.ndarray:
+    """Frame of the surveyed body in that of the true one, from the codes; identity if it was not surveyed."""
+    if not surveyed.exists():
+        return np.eye(4)
+    true = dict(zip(true_body["ids"], true_body["xyz_mm"], strict=True))
+    entries = {e["id"]: e["xyz_mm"] for e in yaml.safe_load(surveyed.read_text())["targets"] if e["code"]}
+    both = [i for i in entries if i in true and entries[i] is not None]
+    mine, theirs = (np.array([source[i] for i in both]) / 1e3 for source in (entries, true))
+    return np.asarray(best_frame(mine, theirs[None])[0])
 
 
 def main() -> None:
