@@ -51,15 +51,17 @@ class Accuracy:
     survey_s: float
 
 
-def rendered(cache: Path, *, images: int, size: float, seed: int, small: bool, start: str) -> Path:
+def rendered(cache: Path, *, images: int, size: float, seed: int, small: bool, start: str, listed: bool = True) -> Path:
     """Folder with campaign/ and truth/, rendered if it is not there yet."""
-    name = f"survey-{images}-{size:g}-{seed}{'-small' if small else ''}-{start}"
+    name = f"survey-{images}-{size:g}-{seed}{'-small' if small else ''}-{start}{'' if listed else '-unlisted'}"
     folder = cache / name
     if not (folder / "done").exists():
         camera = {"width": 1280, "height": 1024, "focal_mm": 8.0, "pixel_um": 4.8} if small else {}
         plate = target_plate(size=size, diameter=(0.014 if small else 0.010) * size, seed=seed)
         plan = full_campaign(seed=seed, survey_images=images, identify=0, verify=0, body=plate, **camera)
-        write_image_campaign(replace(plan, start_values=start), folder / "campaign", folder / "truth")
+        write_image_campaign(
+            replace(plan, start_values=start, bars_listed=listed), folder / "campaign", folder / "truth"
+        )
         (folder / "done").touch()
     return folder
 
@@ -207,6 +209,7 @@ def main() -> None:
     parser.add_argument("--size", type=float, default=1.0, help="side of the plate, m")
     parser.add_argument("--small", action="store_true", help="images of 1.3 megapixels")
     parser.add_argument("--start", choices=("none", "rough"), default="none")
+    parser.add_argument("--bars-unlisted", action="store_true", help="the body file does not list the scale bars")
     parser.add_argument("--cache", type=Path, default=Path("build/benchmarks"))
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     given = parser.parse_args()
@@ -214,8 +217,9 @@ def main() -> None:
     print("                     px        um     um      ppm                    s       s")
     for seed in given.seeds:
         folder = rendered(
-            given.cache, images=given.images, size=given.size, seed=seed, small=given.small, start=given.start
-        )
+            given.cache, images=given.images, size=given.size, seed=seed, small=given.small, start=given.start,
+            listed=not given.bars_unlisted,
+        )  # fmt: skip
         a = judge(folder, given.workers)
         print(
             f"{seed:4d} {a.images:6d} {a.targets:7d}  {a.centroid_px:8.4f} {a.rms_um:6.2f} {a.stated_um:6.2f} "
