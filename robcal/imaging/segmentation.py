@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from robcal.imaging.detections import Reason, RejectionLog
 from robcal.imaging.noise import NoiseModel
@@ -23,6 +24,7 @@ Array = NDArray[np.float64]
 
 _MAX_NODES = 5000  # thresholds tried in one image; a photograph of something else must not take minutes
 _MAX_PARTS = 3000  # connected parts above the background, holes included; beyond, the threshold is raised
+_MAX_LARGE = 40  # large parts that are searched with a finer background
 _MAX_DEPTH = 7
 _CROSS = np.ones((5, 5), np.uint8)
 
@@ -93,26 +95,17 @@ def find_candidates(
     image : (h, w) uint8 or uint16, bright dots (dark ones are turned over by the caller).
     noise : its noise model. settings : limits. log : takes what is refused, with the reason.
     """
-    background = coarse_background(image, settings.max_axis_px)
-    top = int(np.iinfo(image.dtype).max)
-    lift = max(5.0 * float(np.sqrt(noise.at(float(np.median(background))))), 1.5 * noise.step)
-    while True:
-        threshold = cv2.add(background, float(min(int(np.ceil(lift)), top)))
-        contours, hierarchy = cv2.findContours(
-            cv2.compare(image, threshold, cv2.CMP_GT), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE
-        )
-        # texture and dust without end: look at what stands out more
-        if len(contours) <= _MAX_PARTS or lift > 0.3 * top:
-            break
-        lift *= 1.6
-    above = cv2.compare(image, threshold, cv2.CMP_GT)
-    nodes = _first_nodes(above, threshold, contours, hierarchy, settings, log)
+    nodes = _nodes_above_background(image, settings.max_axis_px, noise, settings, log)
+    # a part too large to be a dot may carry dots: what rises above a finer background within it
+    for node in nodes[: _MAX_LARGE]:
+        if max(node.mask.shape) > 2.2 * settings.max_axis_px + 2.0:
+            nodes += _finer_nodes(node, image, settings.max_axis_px / 4.0, noise, settings, log)
     found: list[tuple[float, ...]] = []
     visited = 0
     while nodes and visited < _MAX_NODES:
         visited += 1
         _split(nodes.pop(), image, noise, settings, nodes, found, log)
-    rows = np.array(found, dtype=float).reshape(-1, 8)
+    rows = _distinct(np.array(found, dtype=float).reshape(-1, 8))
     if len(rows) > settings.max_candidates:
         order = np.argsort(-(rows[:, 6] - rows[:, 5]))
         log.count(Reason.OVER_CAP, len(rows) - settings.max_candidates)
@@ -121,9 +114,63 @@ def find_candidates(
     return Candidates(rows[:, :2], rows[:, 2:4], rows[:, 4], rows[:, 5], rows[:, 6], rows[:, 7], bool(nodes))
 
 
+def _nodes_above_background(
+    image: NDArray, scale: float, noise: NoiseModel, settings: DetectionSettings, log: RejectionLog
+) -> list[_Node]:
+    """Connected parts of an image above its background at a scale, the largest first."""
+    background = coarse_background(image, scale)
+    top = int(np.iinfo(image.dtype).max)
+    every = max(1, int(np.sqrt(image.size / 40_000)))
+    typical = background[::every, ::every]
+    # an opening runs along the lower side of texture and noise
+    offset = max(0.0, float(np.median(image[::every, ::every].astype(float) - typical)))
+    lift = offset + max(5.0 * float(np.sqrt(noise.at(float(np.median(typical))))), 1.5 * noise.step)
+    while True:
+        threshold = cv2.add(background, float(min(int(np.ceil(lift)), top)))
+        above = cv2.compare(image, threshold, cv2.CMP_GT)
+        contours, hierarchy = cv2.findContours(above, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
+        # texture and dust without end: look at what stands out more
+        if len(contours) <= _MAX_PARTS or lift > 0.3 * top:
+            break
+        lift *= 1.6
+    return _first_nodes(above, background, offset, contours, hierarchy, settings, log)
+
+
+def _finer_nodes(
+    node: _Node, image: NDArray, scale: float, noise: NoiseModel, settings: DetectionSettings, log: RejectionLog
+) -> list[_Node]:
+    """Parts of a large node above a finer background; finer again where they are still large."""
+    height, width = node.mask.shape
+    crop = image[node.y : node.y + height, node.x : node.x + width]
+    # what lies outside the part is dark and would pull the background down along its border
+    filled = np.where(node.mask > 0, crop, int(np.median(crop[node.mask > 0]))).astype(image.dtype)
+    nodes: list[_Node] = []
+    for part in _nodes_above_background(filled, scale, noise, settings, log)[:_MAX_PARTS]:
+        moved = _Node(part.x + node.x, part.y + node.y, part.mask, part.base, part.depth + 1)
+        nodes.append(moved)
+        if max(part.mask.shape) > 6.6 * scale and scale > 12.0 and part.mask.size < 0.9 * node.mask.size:
+            nodes += _finer_nodes(moved, image, scale / 3.0, noise, settings, log)
+    return nodes
+
+
+def _distinct(rows: Array) -> Array:
+    """Blobs (n, 8) without those found twice; of these the one with the higher base fits its surroundings better."""
+    if len(rows) < 2:
+        return rows
+    keep = np.ones(len(rows), bool)
+    for first, second in cKDTree(rows[:, :2]).query_pairs(0.35 * float(rows[:, 3].max()), output_type="ndarray"):
+        if not keep[first] or not keep[second]:
+            continue
+        a, b = rows[first], rows[second]
+        close = np.hypot(a[0] - b[0], a[1] - b[1]) < 0.35 * min(a[3], b[3])
+        if close and 0.7 < a[2] / b[2] < 1.43 and 0.7 < a[3] / b[3] < 1.43:
+            keep[first if a[5] < b[5] else second] = False
+    return rows[keep]
+
+
 def _first_nodes(
-    above: NDArray[np.uint8], threshold: NDArray, contours: Sequence[NDArray], hierarchy: NDArray | None,
-    settings: DetectionSettings, log: RejectionLog,
+    above: NDArray[np.uint8], background: NDArray, offset: float, contours: Sequence[NDArray],
+    hierarchy: NDArray | None, settings: DetectionSettings, log: RejectionLog,
 ) -> list[_Node]:  # fmt: skip
     """Connected parts above the background, by contours (fast where there are few), small ones last in the list."""
     nodes: list[_Node] = []
@@ -156,7 +203,7 @@ def _first_nodes(
         number, labels = cv2.connectedComponents(part, connectivity=8)
         if number > 2:  # others reach into the box
             part = (labels == labels[py, px]).view(np.uint8)
-        base = float(threshold[y + height // 2, x + width // 2])
+        base = float(background[y + height // 2, x + width // 2]) + offset
         nodes.append(_Node(x, y, part, base, 0))
     return nodes
 
@@ -174,8 +221,8 @@ def _split(
     # a high but not the highest value: one hot pixel is no peak
     rank = min(3, inside.size // 6)
     peak = float(inside.max() if rank == 0 else np.partition(inside, inside.size - 1 - rank)[inside.size - 1 - rank])
-    sigma = float(np.sqrt(noise.at(node.base)))
-    if peak - node.base < 0.5 * settings.min_contrast_sigma * sigma:
+    sigma = max(float(np.sqrt(noise.at(node.base))), _rough_sigma(crop, node.mask) if inside.size > 200 else 0.0)
+    if peak - node.base < 0.6 * settings.min_contrast_sigma * sigma:
         if node.depth == 0:
             log.add(node.x + width / 2, node.y + height / 2, max(width, height) / 2, Reason.CONTRAST)
         return
@@ -189,11 +236,14 @@ def _split(
         box = (slice(upper, upper + h), slice(left, left + w))
         mask = (labels[box] == part).view(np.uint8)
         x, y = node.x + left, node.y + upper
+        values = crop[box][mask > 0]
+        part_peak = float(values.max())
+        # crumbs of noise along the level's contour on a slope
+        if part_peak - level < 0.3 * settings.min_contrast_sigma * sigma:
+            continue
         reason = _judge(mask, crop[box], area, level, node.base, (x, y), image.shape, settings, found)
         if reason is None:
             continue
-        values = crop[box][mask > 0]
-        part_peak = float(values.max())
         # an evenly bright part has no dots of its own inside
         even = float(values.mean()) - level > 0.5 * (part_peak - level)
         if node.depth < _MAX_DEPTH and area > 12 and (not even or reason is Reason.TOO_LARGE) and part_peak - level > (
@@ -208,6 +258,18 @@ def _split(
         rest = np.where(cv2.dilate(core, _CROSS) > 0, 0, node.mask).astype(np.uint8)
         if np.count_nonzero(rest) >= 6:
             _add_rest(rest, node, crop, settings.min_contrast_sigma * sigma, nodes)
+
+
+def _rough_sigma(crop: NDArray, mask: NDArray[np.uint8]) -> float:
+    """Noise inside a large node, by the median of second differences along rows."""
+    values = crop.astype(np.float32)
+    second = values[:, 2:] - 2.0 * values[:, 1:-1] + values[:, :-2]
+    inside = (mask[:, 2:] > 0) & (mask[:, :-2] > 0)
+    if np.count_nonzero(inside) < 50:
+        return 0.0
+    # mean of the smaller half of |z| is 0.319 sigma; unlike the median it is not quantised
+    size = np.abs(second[inside])
+    return float(np.partition(size, size.size // 2)[: size.size // 2].mean() / (0.319 * np.sqrt(6.0)))
 
 
 def _add_rest(rest: NDArray[np.uint8], node: _Node, crop: NDArray, lift: float, nodes: list[_Node]) -> None:
