@@ -9,6 +9,8 @@ pycolmap are conditional and assume unit weight.
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -84,6 +86,17 @@ def export_colmap(network: CameraNetwork, folder: Path) -> None:
             file.replace(folder / file.name)
 
 
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Only errors of COLMAP on standard error."""
+    before = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = 2
+    try:
+        yield
+    finally:
+        pycolmap.logging.minloglevel = before
+
+
 def adjust_with_colmap(
     network: CameraNetwork, *, lengths: Lengths | None = None, check_lengths: Lengths | None = None
 ) -> CameraNetwork:
@@ -112,7 +125,8 @@ def adjust_with_colmap(
     options.ceres.solver_options.function_tolerance = 1e-12
     options.ceres.solver_options.gradient_tolerance = 1e-10
     options.ceres.solver_options.max_num_iterations = 200
-    pycolmap.bundle_adjustment(model, options)
+    with _quiet():
+        pycolmap.bundle_adjustment(model, options)
     values = np.array(model.cameras[1].params)
     camera = Camera(c.width, c.height, *values[:2], *(values[2:4] - 0.5), *values[4:8])
     n, t = len(network.image_names), len(network.ids)

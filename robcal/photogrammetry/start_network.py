@@ -21,7 +21,7 @@ from robcal.photogrammetry.camera import Camera, project
 from robcal.photogrammetry.datum import Datum
 from robcal.photogrammetry.determinacy import intrinsics_basis
 from robcal.photogrammetry.network import ImageMarks
-from robcal.photogrammetry.start_planar import best_references, plane_share, planar_starts
+from robcal.photogrammetry.start_planar import best_references, planar_starts, plane_share
 from robcal.photogrammetry.start_resection import ideal_points, resect, robust_cost
 from robcal.transforms import Array, frame
 

@@ -29,7 +29,7 @@ class PlanarStart:
 
 
 def plane_share(marks: ImageMarks, reference: int, targets: int, size: float) -> float:
-    """Share of marks that homographies from the reference explain to half a per cent of the image: near 1 for a plane."""
+    """Share of marks that homographies from the reference explain to half a per cent of the image: 1 for a plane."""
     shares = []
     lookup = np.full((targets, 2), np.nan)
     own = marks.image == reference

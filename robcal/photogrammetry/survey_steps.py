@@ -24,6 +24,8 @@ from robcal.transforms import Array
 
 _FIRST_NEW_ID = 4096
 """Ids given by the survey start here: above all ring12 codes."""
+_ROUNDS = 5
+"""Rounds of matching and adjustment at most; usually three suffice."""
 
 
 class Survey:
@@ -197,15 +199,25 @@ class Survey:
         """Find the uncoded dots: known points first, then new ones, each time followed by an adjustment."""
         if not self.data.has_free():
             return network
-        for first in (True, False):
-            if not first:
+        # what is found sharpens the predictions for what is still missing
+        for round_ in range(_ROUNDS):
+            before = int(np.count_nonzero(self.data.assigned >= 0))
+            if round_ > 0:
                 self._place_late(network)
             self._match_known(network)
-            if self.settings.new_points and first:
+            if self.settings.new_points:
                 self._identify_given(network)
                 self._find_new(network)
-            settings = self.adjust_settings if not first else replace(self.adjust_settings, hold_focal=True)
+            gained = int(np.count_nonzero(self.data.assigned >= 0)) - before
+            if gained == 0 and round_ > 0:
+                break
+            last = round_ == _ROUNDS - 1 or gained < 0.02 * before
+            settings = self.adjust_settings if last else replace(self.adjust_settings, hold_focal=True)
             network = self._readjust(network, settings=settings)
+            self._take_over(network)
+        if "fx" not in network.free_intrinsics and not self.adjust_settings.hold_focal:
+            # held only for the time of the matching; now it must be determined, or be said not to be
+            network = self._readjust(network)
             self._take_over(network)
         return network
 

@@ -56,7 +56,9 @@ def test_normal_equations_against_a_dense_solution() -> None:
     size = k + 3 * t + 6 * n
     steps = np.full(size, 1e-6)
     steps[:3] = 1e-3
-    J = np.stack([-(residuals(h * e) - residuals(-h * e)) / (2 * h) for h, e in zip(steps, np.eye(size), strict=True)], 1)
+    J = np.stack(
+        [-(residuals(h * e) - residuals(-h * e)) / (2 * h) for h, e in zip(steps, np.eye(size), strict=True)], 1
+    )
     dense = np.zeros((len(marks), 2, size))
     for row, (i, j) in enumerate(zip(order.marks.image, order.marks.target, strict=True)):
         dense[row, :, :k] = lin.J[row, :, :k]
@@ -90,9 +92,7 @@ def test_normal_equations_against_a_dense_solution() -> None:
     a = k + 3 * t
     unit = np.outer(scale, scale)
     np.testing.assert_allclose(Q / unit[:a, :a], inverse[:a, :a] / unit[:a, :a], atol=1e-5)
-    np.testing.assert_allclose(
-        Q_mixed.reshape(a, -1) / unit[:a, a:], inverse[:a, a:] / unit[:a, a:], atol=1e-5
-    )
+    np.testing.assert_allclose(Q_mixed.reshape(a, -1) / unit[:a, a:], inverse[:a, a:] / unit[:a, a:], atol=1e-5)
     for i in range(n):
         at = slice(a + 6 * i, a + 6 * i + 6)
         np.testing.assert_allclose(Q_station[i] / unit[at, at], inverse[at, at] / unit[at, at], atol=1e-5)
@@ -322,11 +322,11 @@ def test_contradictory_scale_bars_are_named() -> None:
     truth = make_network(rng, images=12, targets=20)
     pairs = [[0, 19], [4, 15], [0, 15]]
     true = np.array([length_of(truth, i, j) for i, j in pairs])
-    good = Lengths(pairs, true + [2e-6, -3e-6, 1e-6], np.full(3, 5e-6))
+    good = Lengths(pairs, true + np.array([2e-6, -3e-6, 1e-6]), np.full(3, 5e-6))
     net = adjust(truth.marks, *near(truth, rng), lengths=good)
     assert all(abs(b.w) < 4 for b in net.scale_bars)
     with pytest.raises(InvalidInput, match=r"contradict.*worst 4-15") as caught:
-        adjust(truth.marks, *near(truth, rng), lengths=replace(good, length=good.length + [0.0, 1e-3, 0.0]))
+        adjust(truth.marks, *near(truth, rng), lengths=replace(good, length=good.length + np.array([0.0, 1e-3, 0.0])))
     assert "mm" in str(caught.value)
 
 
