@@ -14,10 +14,9 @@ from robcal.diagnosis.family_wise import FamilyWise, simulate
 from robcal.diagnosis.naming import Posterior, posterior
 from robcal.diagnosis.recording import Accepted, Fit, Recording
 from robcal.diagnosis.scan import Entry, ScanResult, Stack, orthonormal_basis, scan, stack_entries
-from robcal.physics.family import Constants, Family
+from robcal.physics.family import Array, Constants, Family
 from robcal.physics.library import all_families
 from robcal.physics.site import RobotSite
-from robcal.transforms import Array
 
 
 @dataclass(frozen=True)
@@ -65,7 +64,12 @@ def library_at(fit: Fit, recording: Recording, at: Tangents, tied: frozenset[str
 
 
 def analyse(
-    fit: Fit, recording: Recording, tied: frozenset[str], *, runs: int = 400, level: FamilyWise | None = None,
+    fit: Fit,
+    recording: Recording,
+    tied: frozenset[str],
+    *,
+    runs: int = 400,
+    level: FamilyWise | None = None,
 ) -> Analysis:
     """Scan all candidates at a fit; `level` reuses a simulated family-wise level of the same design."""
     at = tangents(fit, recording)
@@ -80,14 +84,26 @@ def extend(analysis: Analysis, columns: Array) -> Analysis:
     projected = columns - analysis.basis @ (analysis.basis.T @ columns)
     basis = np.concatenate([analysis.basis, orthonormal_basis(projected)], axis=1)
     return _look(
-        analysis.fit, analysis.at, analysis.families, analysis.entries, basis, 0, analysis.family_wise,
+        analysis.fit,
+        analysis.at,
+        analysis.families,
+        analysis.entries,
+        basis,
+        0,
+        analysis.family_wise,
         analysis.at.recording,
     )
 
 
 def _look(
-    fit: Fit, at: Tangents, families: Sequence[Family], listed: Sequence[Entry], basis: Array, runs: int,
-    level: FamilyWise | None, recording: Recording,
+    fit: Fit,
+    at: Tangents,
+    families: Sequence[Family],
+    listed: Sequence[Entry],
+    basis: Array,
+    runs: int,
+    level: FamilyWise | None,
+    recording: Recording,
 ) -> Analysis:
     residual = fit.residual - basis @ (basis.T @ fit.residual)
     redundancy = len(residual) - basis.shape[1]
@@ -99,7 +115,18 @@ def _look(
     named = np.array([family.cause != "unknown" for family in families])
     suspect = worst_group(residual, basis, recording.row_groups(len(residual)))
     return Analysis(
-        fit, at, tuple(families), named, tuple(listed), basis, residual, stacks, result, ranked, family_wise, p_value,
+        fit,
+        at,
+        tuple(families),
+        named,
+        tuple(listed),
+        basis,
+        residual,
+        stacks,
+        result,
+        ranked,
+        family_wise,
+        p_value,
         suspect,
     )
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from robcal.diagnosis.scan import log_f_probability
-from robcal.transforms import Array
+from robcal.physics.family import Array
 
 BLUNDER_SIGNAL = 30.0
 """Prior size of a gross error in units of sigma."""
@@ -34,13 +34,12 @@ def worst_group(residual: Array, fitted: Array, group: Array) -> Suspect:
     order = np.argsort(inverse, kind="stable")
     bounds = np.concatenate([[0], np.cumsum(counts)])
     variance = total / max(redundancy, 1)
-    best = Suspect(int(labels[0]), -np.inf, 0.0)
     gain = BLUNDER_SIGNAL**2
     raw = np.zeros(len(labels))
     used = np.zeros(len(labels), dtype=int)
     kept: list[Array] = []
     for k in range(len(labels)):
-        rows = order[bounds[k]: bounds[k + 1]]
+        rows = order[bounds[k] : bounds[k + 1]]
         cofactor = np.eye(len(rows)) - fitted[rows] @ fitted[rows].T
         values, vectors = np.linalg.eigh(cofactor)
         seen = values > 0.02
@@ -52,5 +51,4 @@ def worst_group(residual: Array, fitted: Array, group: Array) -> Suspect:
     variance = max((total - raw[k]) / max(redundancy - used[k], 1), 1e-300)
     signal = gain * kept[k]
     evidence = 0.5 * raw[k] / variance * gain / (1 + gain) - 0.5 * float(np.sum(np.log1p(signal)))
-    best = Suspect(int(labels[k]), evidence - float(np.log(len(labels))), float(log_p[k]))
-    return best
+    return Suspect(int(labels[k]), evidence - float(np.log(len(labels))), float(log_p[k]))

@@ -9,9 +9,8 @@ import numpy as np
 
 from robcal.diagnosis.recording import Fit, Recording, observation_data
 from robcal.diagnosis.scan import Entry
-from robcal.physics.family import Constants, Family, ObservationData
+from robcal.physics.family import Array, Constants, Family, ObservationData
 from robcal.robot.terms import evaluate
-from robcal.transforms import Array
 
 
 @dataclass(frozen=True)
@@ -58,8 +57,12 @@ def tangents(fit: Fit, recording: Recording) -> Tangents:
     _, whitened = recording.linearise(fit.frames, all_parameters)
     variables = kernel.variables(fit.theta, fit.inputs)
     return Tangents(
-        recording, {(key[0], key[1]): motion[:, i] for i, key in enumerate(keys)},
-        {name: whitened[:, i] for i, name in enumerate(kernel.names)}, variables, fit.row_pose, fit.frames,
+        recording,
+        {(key[0], key[1]): motion[:, i] for i, key in enumerate(keys)},
+        {name: whitened[:, i] for i, name in enumerate(kernel.names)},
+        variables,
+        fit.row_pose,
+        fit.frames,
         observation_data(recording, fit.frames, variables),
     )
 

@@ -13,10 +13,16 @@ from robcal.diagnosis.result import Diagnosis, Finding
 def as_contract(diagnosis: Diagnosis) -> dict[str, object]:
     """The content of diagnosis.json for a robot's recording."""
     first = diagnosis.findings[0] if diagnosis.findings else None
-    location = None if first is None else {
-        "stage": first.family.stage, "where": first.family.where, "direction": first.family.direction,
-        "poses": list(first.poses),
-    }
+    location = (
+        None
+        if first is None
+        else {
+            "stage": first.family.stage,
+            "where": first.family.where,
+            "direction": first.family.direction,
+            "poses": list(first.poses),
+        }
+    )
     return {
         "format": "robcal/diagnosis-1",
         "mismatch": diagnosis.mismatch,
@@ -25,11 +31,14 @@ def as_contract(diagnosis: Diagnosis) -> dict[str, object]:
         "location": location,
         "causes": [_cause(finding) for finding in diagnosis.findings],
         "heldout_mm": {
-            "before": number(diagnosis.heldout[0] * 1e3), "after": number(diagnosis.heldout[1] * 1e3),
-            "noise_floor": number(diagnosis.heldout[2] * 1e3), "kind": diagnosis.heldout_kind,
+            "before": number(diagnosis.heldout[0] * 1e3),
+            "after": number(diagnosis.heldout[1] * 1e3),
+            "noise_floor": number(diagnosis.heldout[2] * 1e3),
+            "kind": diagnosis.heldout_kind,
         },
         "noise": {
-            "stated": 1.0, "estimated": number(diagnosis.noise_estimated),
+            "stated": 1.0,
+            "estimated": number(diagnosis.noise_estimated),
             "joint_repeatability_deg": number(math.degrees(diagnosis.joint_sigma)),
         },
         "unexplained": {"p_value": number(diagnosis.unexplained_p), "pattern": diagnosis.unexplained_pattern},
@@ -43,15 +52,21 @@ def as_contract(diagnosis: Diagnosis) -> dict[str, object]:
 def _cause(finding: Finding) -> dict[str, object]:
     family = finding.family
     return {
-        "cause": family.cause, "stage": family.stage, "where": family.where, "direction": family.direction,
+        "cause": family.cause,
+        "stage": family.stage,
+        "where": family.where,
+        "direction": family.direction,
         "parameters": {name: number(value) for name, value in finding.parameters.items()},
         "sigma": {name: number(value) for name, value in finding.sigma.items()},
         "p_value": number(finding.p_value),
         "log_evidence": number(finding.log_evidence),
         "indistinguishable_from": [
             {
-                "cause": rival.family.cause, "where": rival.family.where, "direction": rival.family.direction,
-                "probability": number(rival.probability), "overlap": number(rival.overlap),
+                "cause": rival.family.cause,
+                "where": rival.family.where,
+                "direction": rival.family.direction,
+                "probability": number(rival.probability),
+                "overlap": number(rival.overlap),
             }
             for rival in finding.rivals
         ],
@@ -65,7 +80,10 @@ def _cause(finding: Finding) -> dict[str, object]:
 def image_cause(finding: ImageFinding) -> dict[str, object]:
     """One cause found in images, in the contract's form."""
     return {
-        "cause": finding.cause, "stage": finding.stage, "where": finding.where, "direction": finding.direction,
+        "cause": finding.cause,
+        "stage": finding.stage,
+        "where": finding.where,
+        "direction": finding.direction,
         "parameters": {name: number(value) for name, value in finding.parameters.items()},
         "sigma": {name: number(value) for name, value in finding.sigma.items()},
         "p_value": number(finding.p_value),
@@ -76,7 +94,10 @@ def image_cause(finding: ImageFinding) -> dict[str, object]:
 
 
 def with_images(
-    robot: dict[str, object] | None, findings: Sequence[ImageFinding], scans: Sequence[ImageDiagnosis], noise: float,
+    robot: dict[str, object] | None,
+    findings: Sequence[ImageFinding],
+    scans: Sequence[ImageDiagnosis],
+    noise: float,
 ) -> dict[str, object]:
     """The content of diagnosis.json for images alone, or the robot's extended by what the images say first.
 
@@ -89,12 +110,21 @@ def with_images(
             return robot
         first = findings[0]
         statements = ". ".join(finding.statement for finding in findings) + "."
-        text = f"{statements} {robot['statement']}" if robot["mismatch"] else f"{statements} Beyond that nothing is missing."
+        text = (
+            f"{statements} {robot['statement']}"
+            if robot["mismatch"]
+            else f"{statements} Beyond that nothing is missing."
+        )
         return robot | {
-            "mismatch": True, "p_value": number(min(first.p_value, float(str(robot["p_value"])))), "statement": text,
-            "location": _place(first), "causes": [*causes, *_listed(robot["causes"])],
+            "mismatch": True,
+            "p_value": number(min(first.p_value, float(str(robot["p_value"])))),
+            "statement": text,
+            "location": _place(first),
+            "causes": [*causes, *_listed(robot["causes"])],
         }
-    before = max((finding.heldout_px[0] for finding in findings), default=max((s.heldout_px[0] for s in scans), default=0.0))
+    before = max(
+        (finding.heldout_px[0] for finding in findings), default=max((s.heldout_px[0] for s in scans), default=0.0)
+    )
     after = max((scan.heldout_px[1] for scan in scans), default=0.0)
     floor = max((scan.heldout_px[2] for scan in scans), default=0.0)
     left = min((scan.unexplained_p for scan in scans), default=1.0)
@@ -109,7 +139,8 @@ def with_images(
         "heldout_px": {"before": number(before), "after": number(after), "noise_floor": number(floor)},
         "noise": {"stated": 1.0, "estimated": number(noise)},
         "unexplained": {
-            "p_value": number(left), "pattern": None if left > 0.01 else "a smooth field over the image, small against the noise",
+            "p_value": number(left),
+            "pattern": None if left > 0.01 else "a smooth field over the image, small against the noise",
         },
         "blunders": [],
         "next_poses": [],
@@ -132,7 +163,9 @@ def summary(diagnosis: Diagnosis) -> str:
         if diagnosis.noise_estimated > 1.15 or diagnosis.noise_estimated < 0.85:
             text += f" (the data scatter {diagnosis.noise_estimated:.2f} times what their covariance says)"
         return text + "."
-    parts = [f"{finding.statement}; it explains {finding.explained:.0%} of what was left" for finding in diagnosis.findings]
+    parts = [
+        f"{finding.statement}; it explains {finding.explained:.0%} of what was left" for finding in diagnosis.findings
+    ]
     return ". ".join(parts) + "."
 
 

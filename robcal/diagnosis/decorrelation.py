@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from robcal.transforms import Array
+from robcal.physics.family import Array
 
 
 @dataclass(frozen=True)

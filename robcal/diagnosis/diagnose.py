@@ -19,12 +19,17 @@ from robcal.diagnosis.swaps import find_swaps, relabelled
 from robcal.physics.family import ObservationData, numeric_sigma
 from robcal.physics.measuring import describe, swapped
 from robcal.robot.model import RobotModel
-from robcal.transforms import Array
+
+DEFAULTS = SelectionSettings()
 
 
 def diagnose(
-    model: RobotModel, recording: Recording, free: Iterable[str], tied: Iterable[str] = (),
-    verify: Recording | None = None, settings: SelectionSettings = SelectionSettings(),
+    model: RobotModel,
+    recording: Recording,
+    free: Iterable[str],
+    tied: Iterable[str] = (),
+    verify: Recording | None = None,
+    settings: SelectionSettings = DEFAULTS,
     tell: Callable[[str], None] = lambda text: None,
 ) -> Diagnosis:
     """Find what a fitted robot model leaves out, name it, add it, and measure the gain on data kept out.
@@ -65,15 +70,27 @@ def diagnose(
         family = last.families[last.top(np.ones(len(last.families), dtype=bool))]
         pattern = f"{family.where} {family.direction or ''} with {', '.join(family.covariates) or 'no covariate'}"
     return Diagnosis(
-        p_value=0.0 if exchanged else chosen.p_values[0] if chosen.p_values else chosen.last.p_value, findings=findings, blunders=blunders,
-        noise_estimated=float(np.sqrt(noise.factor)), joint_sigma=noise.joint_sigma, unexplained_p=last.p_value,
-        unexplained_pattern=pattern, heldout=heldout, heldout_kind="verify" if verify is not None else "cross-validation",
-        model=final.model, free=final.free, next_poses=poses, seconds=time.perf_counter() - start,
+        p_value=0.0 if exchanged else chosen.p_values[0] if chosen.p_values else chosen.last.p_value,
+        findings=findings,
+        blunders=blunders,
+        noise_estimated=float(np.sqrt(noise.factor)),
+        joint_sigma=noise.joint_sigma,
+        unexplained_p=last.p_value,
+        unexplained_pattern=pattern,
+        heldout=heldout,
+        heldout_kind="verify" if verify is not None else "cross-validation",
+        model=final.model,
+        free=final.free,
+        next_poses=poses,
+        seconds=time.perf_counter() - start,
     )
 
 
 def _swap_findings(
-    model: RobotModel, recording: Recording, verify: Recording | None, free: tuple[str, ...],
+    model: RobotModel,
+    recording: Recording,
+    verify: Recording | None,
+    free: tuple[str, ...],
     swaps: tuple[tuple[int, int], ...],
 ) -> tuple[Finding, ...]:
     """Exchanged numbers are told before everything else; the gain is that of reading them right."""
@@ -87,7 +104,18 @@ def _swap_findings(
         told = family.report(np.ones(1), {})
         findings.append(
             Finding(
-                family, {}, np.ones(1), np.zeros((1, 1)), told, {}, 0.0, float("inf"), (), 1.0, (), (before, after),
+                family,
+                {},
+                np.ones(1),
+                np.zeros((1, 1)),
+                told,
+                {},
+                0.0,
+                float("inf"),
+                (),
+                1.0,
+                (),
+                (before, after),
                 describe(family.sentence, family.where, None, told),
             )
         )
@@ -114,7 +142,11 @@ def _error(recording: Recording, fitted: Fit, verify: Recording | None) -> float
 
 
 def _findings(
-    model: RobotModel, chosen: Selection, free: Sequence[str], tied: frozenset[str], verify: Recording | None,
+    model: RobotModel,
+    chosen: Selection,
+    free: Sequence[str],
+    tied: frozenset[str],
+    verify: Recording | None,
     before: Fit,
 ) -> tuple[Finding, ...]:
     final = chosen.last.fit
@@ -122,7 +154,9 @@ def _findings(
     error = _error(chosen.recording, before, verify)
     for k, item in enumerate(final.accepted):
         others = tuple(other for j, other in enumerate(final.accepted) if j != k)
-        look = chosen.first if not others else analyse(fit(model, chosen.recording, free, others), chosen.recording, tied)
+        look = (
+            chosen.first if not others else analyse(fit(model, chosen.recording, free, others), chosen.recording, tied)
+        )
         partial = fit(model, chosen.recording, free, final.accepted[: k + 1])
         after = _error(chosen.recording, partial, verify)
         findings.append(_finding(look, item, chosen.p_values[k], (error, after), chosen))
@@ -136,7 +170,8 @@ def _finding(
     family = item.family
     columns = look.at.columns(family, item.constants)
     projected = signature(columns, item.values, look.basis)
-    named = next((f for f, other in enumerate(look.families) if other.key == family.key and other.covariates == family.covariates), -1)
+    alike = (f for f, o in enumerate(look.families) if o.key == family.key and o.covariates == family.covariates)
+    named = next(alike, -1)
     others: tuple[Rival, ...] = ()
     evidence = 0.0
     if named >= 0:
@@ -149,10 +184,23 @@ def _finding(
     excess = float(look.residual @ look.residual) - factor * look.result.redundancy
     explained = float(np.clip(projected @ look.residual / max(excess, 1e-300), 0.0, 1.0))
     carry = poses_that_carry(projected, look.fit.row_pose, chosen.recording.names)
-    told = {name: chosen.recording.pose_name(value) if name == "pose" else value for name, value in told.items()}
+    told = {
+        name: chosen.recording.pose_name(float(str(value))) if name == "pose" else value for name, value in told.items()
+    }
     if "pose" in sigma:
         del sigma["pose"]
     return Finding(
-        family, item.constants, item.values, covariance, told, sigma, p_value, evidence, others, explained, carry,
-        heldout, describe(family.sentence, family.where, family.direction, told),
+        family,
+        item.constants,
+        item.values,
+        covariance,
+        told,
+        sigma,
+        p_value,
+        evidence,
+        others,
+        explained,
+        carry,
+        heldout,
+        describe(family.sentence, family.where, family.direction, told),
     )

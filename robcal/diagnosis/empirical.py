@@ -11,10 +11,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from robcal.physics.family import Basis, Constants, Family
+from robcal.physics.family import Array, Basis, Constants, Family
 from robcal.physics.site import LETTER_OF_KIND, Joint, RobotSite
 from robcal.robot.terms import identifier
-from robcal.transforms import Array
 
 BUMPS = (4, 7, 12)
 """Numbers of bumps over the range of a covariate: three lengths over which it may vary."""
@@ -38,7 +37,7 @@ def empirical_families(site: RobotSite) -> Iterator[Family]:
             for covariate in covariates:
                 if site.varies(covariate, 1e-6):
                     families.append(_smooth(site, joint, kind, covariate))
-        families.extend(_product(joint, first, second) for i, first in enumerate(joints) for second in joints[i + 1:])
+        families.extend(_product(joint, first, second) for i, first in enumerate(joints) for second in joints[i + 1 :])
         families.append(_bump(site, joint))
     yield from (replace(family, weight=EMPIRICAL_WEIGHT / len(families)) for family in families)
 
@@ -74,9 +73,17 @@ def _smooth(site: RobotSite, joint: Joint, kind: str, covariate: str) -> Family:
 
     # number of parameters changes with the grid, so each number of bumps is a grid point of its own width
     return Family(
-        "unknown", "robot", joint.where, _place(joint, kind), (), (), report,
+        "unknown",
+        "robot",
+        joint.where,
+        _place(joint, kind),
+        (),
+        (),
+        report,
         "Something the library has no name for acts on {where} and follows " + covariate,
-        grid=tuple({"bumps": float(n)} for n in BUMPS), bases=bases, covariates=(covariate,),
+        grid=tuple({"bumps": float(n)} for n in BUMPS),
+        bases=bases,
+        covariates=(covariate,),
     )
 
 
@@ -91,11 +98,17 @@ def _product(joint: Joint, first: Joint, second: Joint) -> Family:
         return tuple(Basis(joint.frame, "q", law, f"c{i}") for i, law in enumerate(laws))
 
     return Family(
-        "unknown", "robot", joint.where, _place(joint, "q"), (), (),
+        "unknown",
+        "robot",
+        joint.where,
+        _place(joint, "q"),
+        (),
+        (),
         lambda v, c: {"term": _term([a, b], "harmonic", _formula(bases(c), v))},
         f"Something the library has no name for acts on {{where}} and follows {a} together with {b}",
         grid=tuple({"first_order": n, "second_order": m} for n in (1.0, 2.0) for m in (1.0, 2.0)),
-        bases=bases, covariates=(a, b),
+        bases=bases,
+        covariates=(a, b),
     )
 
 
@@ -104,18 +117,22 @@ def _bump(site: RobotSite, joint: Joint) -> Family:
     values = site.variables[f"q{k}"]
     low, high = float(np.min(values)), float(np.max(values))
     widths = [share * (high - low) for share in (0.01, 0.025, 0.05)]
-    grid = tuple(
-        {"centre": float(x), "width": w} for w in widths for x in np.arange(low, high + w, w) if w > 1e-6
-    )
+    grid = tuple({"centre": float(x), "width": w} for w in widths for x in np.arange(low, high + w, w) if w > 1e-6)
 
     def bases(c: Constants) -> tuple[Basis, ...]:
         return (Basis(joint.frame, "q", f"exp(-0.5*((q{k} - {c['centre']!r})/{c['width']!r})**2)", "c0"),)
 
     return Family(
-        "unknown", "robot", joint.where, _place(joint, "q"), (), (),
+        "unknown",
+        "robot",
+        joint.where,
+        _place(joint, "q"),
+        (),
+        (),
         lambda v, c: {"term": _term([f"q{k}"], "formula", _formula(bases(c), v))},
         "{where} is disturbed around one angle only (a damaged tooth, a dent)",
-        grid=grid, continuous={"centre": (low, high), "width": (0.003 * (high - low), 0.2 * (high - low))},
-        bases=bases, covariates=(f"q{k}",),
+        grid=grid,
+        continuous={"centre": (low, high), "width": (0.003 * (high - low), 0.2 * (high - low))},
+        bases=bases,
+        covariates=(f"q{k}",),
     )
-

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from robcal.diagnosis.scan import Fitted, Stack, log_f_probability, remove
-from robcal.transforms import Array
+from robcal.physics.family import Array
 
 
 @dataclass(frozen=True)
@@ -33,8 +33,15 @@ class FamilyWise:
 
 
 def simulate(
-    stacks: Sequence[Stack], fitted: Fitted, redundancy: int, rows: int, *, runs: int = 400, seed: int = 0,
-    residual: Array | None = None, block: Array | None = None,
+    stacks: Sequence[Stack],
+    fitted: Fitted,
+    redundancy: int,
+    rows: int,
+    *,
+    runs: int = 400,
+    seed: int = 0,
+    residual: Array | None = None,
+    block: Array | None = None,
 ) -> FamilyWise:
     """Simulate the scan's smallest probability under "nothing is missing".
 

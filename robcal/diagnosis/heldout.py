@@ -8,13 +8,14 @@ import numpy as np
 
 from robcal.calibration.observations import DistanceObservations, FrameObservations, PointObservations
 from robcal.diagnosis.recording import Accepted, Fit, Recording, observation_data, solve
-from robcal.transforms import Array, invert, transform
+from robcal.physics.family import Array
+from robcal.transforms import invert, transform
 
 FOLDS = 8
 
 
 def position_errors(recording: Recording, fitted: Fit, accepted: Sequence[Accepted] | None = None) -> Array:
-    """Measured minus modelled positions (m_obs, 3) of a recording (or lengths (m_obs, 1)) with a model fitted elsewhere."""
+    """Measured minus modelled positions (m_obs, 3), or lengths (m_obs, 1), with a model fitted elsewhere."""
     kernel = fitted.kernel
     inputs = recording.inputs(kernel)
     frames = kernel.frames(fitted.theta, inputs)
@@ -64,7 +65,7 @@ def cross_validated(recording: Recording, fitted: Fit, labels: Array) -> Array:
     predicted = np.empty(m)
     for fold in np.unique(labels):
         test = fold_of_row == fold
-        step, _ = solve(fitted.jacobian[~test], fitted.residual[~test])
+        step = solve(fitted.jacobian[~test], fitted.residual[~test])
         predicted[test] = fitted.residual[test] - fitted.jacobian[test] @ step
     return recording.unwhiten(predicted[:, None], fitted.frames)[:, : min(per, 3), 0]
 

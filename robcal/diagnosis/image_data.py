@@ -1,4 +1,4 @@
-"""Image residuals of a survey or a station as one linear problem: what its unknowns absorb, and the geometry of marks."""
+"""Image residuals of a survey or station as one linear problem: what its unknowns absorb, geometry of the marks."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from robcal.photogrammetry.eccentricity import body_normals
 from robcal.photogrammetry.network import CameraNetwork, Lengths
 from robcal.photogrammetry.station_adjustment import global_columns
 from robcal.photogrammetry.station_network import StationOrientation
-from robcal.transforms import Array, invert, transform
+from robcal.physics.family import Array
+from robcal.transforms import invert, transform
 
 
 @dataclass(frozen=True)
@@ -74,11 +75,26 @@ def survey_data(network: CameraNetwork, lengths: Lengths | None, camera_name: st
         free.add("f_only")
     white = operator.whiten(np.broadcast_to(np.eye(2), (len(marks), 2, 2)))
     return ImageData(
-        (camera_name,), (network.camera,), np.zeros(len(marks), dtype=int), marks.image, network.ids[marks.target],
-        transform(T, network.points[marks.target]), T[:, :3, :3],
-        np.einsum("mij,mj->mi", T[:, :3, :3], normals[marks.target]), marks.xy, operator.residuals, network.redundancy,
-        network.redundancy_total, operator.whiten, operator.project_out, None, None, (frozenset(free),),
-        network.radii[marks.target], float(1.0 / np.sqrt(np.mean(white**2) * 2.0)), network.image_names,
+        (camera_name,),
+        (network.camera,),
+        np.zeros(len(marks), dtype=int),
+        marks.image,
+        network.ids[marks.target],
+        transform(T, network.points[marks.target]),
+        T[:, :3, :3],
+        np.einsum("mij,mj->mi", T[:, :3, :3], normals[marks.target]),
+        marks.xy,
+        operator.residuals,
+        network.redundancy,
+        network.redundancy_total,
+        operator.whiten,
+        operator.project_out,
+        None,
+        None,
+        (frozenset(free),),
+        network.radii[marks.target],
+        float(1.0 / np.sqrt(np.mean(white**2) * 2.0)),
+        network.image_names,
     )
 
 
@@ -113,7 +129,10 @@ def station_data(orientation: StationOrientation, pose_names: tuple[str, ...]) -
     weight = orientation.body.covariance
     held = weight is None or not np.any(weight)
     groups = {
-        "focal": ("fx", "fy"), "principal": ("cx", "cy"), "tangential": ("p1", "p2"), "affinity": ("affinity",),
+        "focal": ("fx", "fy"),
+        "principal": ("cx", "cy"),
+        "tangential": ("p1", "p2"),
+        "affinity": ("affinity",),
     }
     free = tuple(
         frozenset(part for g in orientation.free_interior.get(name, ()) for part in groups.get(g, (g,)))
@@ -121,10 +140,24 @@ def station_data(orientation: StationOrientation, pose_names: tuple[str, ...]) -
     )
     normals = np.where(np.isfinite(marks.normals), marks.normals, np.nan)
     return ImageData(
-        orientation.names, orientation.cameras, marks.camera, marks.pose, orientation.body.ids[marks.target],
-        transform(T, orientation.body.points[marks.target]), T[:, :3, :3],
-        np.einsum("mij,mj->mi", T[:, :3, :3], normals), marks.xy, design.residual.reshape(-1), orientation.redundancy,
-        int(orientation.redundancy_total), whiten, remove, unwhite @ design.by_exterior,
-        unwhite @ design.by_point if held else None, free, np.nan_to_num(marks.radius),
-        float(np.sqrt(np.mean(unwhite**2) * 2.0)), tuple(pose_names[int(p)] for p in orientation.poses),
+        orientation.names,
+        orientation.cameras,
+        marks.camera,
+        marks.pose,
+        orientation.body.ids[marks.target],
+        transform(T, orientation.body.points[marks.target]),
+        T[:, :3, :3],
+        np.einsum("mij,mj->mi", T[:, :3, :3], normals),
+        marks.xy,
+        design.residual.reshape(-1),
+        orientation.redundancy,
+        int(orientation.redundancy_total),
+        whiten,
+        remove,
+        unwhite @ design.by_exterior,
+        unwhite @ design.by_point if held else None,
+        free,
+        np.nan_to_num(marks.radius),
+        float(np.sqrt(np.mean(unwhite**2) * 2.0)),
+        tuple(pose_names[int(p)] for p in orientation.poses),
     )

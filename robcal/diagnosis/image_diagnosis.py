@@ -11,7 +11,7 @@ from robcal.diagnosis.family_wise import simulate
 from robcal.diagnosis.image_causes import ImageCause, image_causes
 from robcal.diagnosis.image_data import ImageData
 from robcal.diagnosis.scan import Entry, ScanResult, Stack, scan, stack_entries
-from robcal.transforms import Array
+from robcal.physics.family import Array
 
 LEVEL = 0.01
 MOST = 5
@@ -57,9 +57,7 @@ def diagnose_images(data: ImageData, *, moves: bool = True, level: float = LEVEL
     size to first order only.
     """
     causes = list(image_causes(data, moves))
-    listed = [
-        Entry(i, 0, data.whiten(cause.columns) * cause.sizes) for i, cause in enumerate(causes)
-    ]
+    listed = [Entry(i, 0, data.whiten(cause.columns) * cause.sizes) for i, cause in enumerate(causes)]
     listed = [entry for entry in listed if np.all(np.isfinite(entry.columns))]
     residual, added = data.residual, np.zeros((len(data.residual), 0))
     redundancy = data.redundancy.reshape(-1).copy()
@@ -95,16 +93,22 @@ def diagnose_images(data: ImageData, *, moves: bool = True, level: float = LEVEL
         told = cause.report(values)
         findings.append(
             ImageFinding(
-                cause.cause, cause.stage, cause.where, cause.direction, told, _sigma(cause, values, covariance), last_p,
-                _rivals(causes, score, chosen), (predicted, after), _sentence(cause, told),
+                cause.cause,
+                cause.stage,
+                cause.where,
+                cause.direction,
+                told,
+                _sigma(cause, values, covariance),
+                last_p,
+                _rivals(causes, score, chosen),
+                (predicted, after),
+                _sentence(cause, told),
             )
         )
         predicted = after
         added = np.concatenate([added, basis], axis=1)
     floor = data.spread
-    return ImageDiagnosis(
-        tuple(findings), first_p if first_p is not None else 1.0, last_p, (before, predicted, floor)
-    )
+    return ImageDiagnosis(tuple(findings), first_p if first_p is not None else 1.0, last_p, (before, predicted, floor))
 
 
 def _without(basis: Array, columns: Array) -> Array:

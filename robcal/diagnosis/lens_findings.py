@@ -12,10 +12,12 @@ from robcal.diagnosis.image_diagnosis import ImageFinding
 from robcal.photogrammetry.camera import INTRINSIC_NAMES, Camera
 from robcal.photogrammetry.network import CameraNetwork
 from robcal.photogrammetry.station_network import Evidence, StationOrientation
-from robcal.transforms import Array
+from robcal.physics.family import Array
 
 LENS_GROUPS: Mapping[str, tuple[str, ...]] = {
-    "lens_radial": ("k1", "k2", "k3"), "lens_tangential": ("p1", "p2"), "lens_affinity": ("fx", "fy"),
+    "lens_radial": ("k1", "k2", "k3"),
+    "lens_tangential": ("p1", "p2"),
+    "lens_affinity": ("fx", "fy"),
 }
 KIND = {"lens_radial": "radial distortion", "lens_tangential": "tangential distortion", "lens_affinity": "affinity"}
 LEVEL = 1e-4
@@ -38,7 +40,9 @@ def survey_findings(network: CameraNetwork, start: Camera | None, name: str) -> 
             given, contrast = start.fy - start.fx, _difference()
         else:
             given = float(np.abs([getattr(start, n) for n in group]).max())
-            contrast = np.array([[float(n == m) for m in INTRINSIC_NAMES] for n in group if n in network.free_intrinsics])
+            contrast = np.array(
+                [[float(n == m) for m in INTRINSIC_NAMES] for n in group if n in network.free_intrinsics]
+            )
         if abs(given) > 1e-9 or not len(contrast):
             continue
         values = contrast @ network.camera.vector
@@ -55,7 +59,10 @@ def survey_findings(network: CameraNetwork, start: Camera | None, name: str) -> 
         sigma = dict(zip(names, map(float, np.sqrt(np.diag(covariance))), strict=True))
         text = f"The lens of camera '{name}' has {KIND[cause]} that its file leaves out"
         found.append(
-            (statistic, ImageFinding(cause, "camera", name, None, dict(told), dict(sigma), p_value, (), (before, rms), text))
+            (
+                statistic,
+                ImageFinding(cause, "camera", name, None, dict(told), dict(sigma), p_value, (), (before, rms), text),
+            )
         )
     return tuple(finding for _, finding in sorted(found, key=lambda item: -item[0]))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy import optimize, special
@@ -11,8 +12,7 @@ from scipy import optimize, special
 from robcal.diagnosis.candidates import Tangents
 from robcal.diagnosis.result import Rival
 from robcal.diagnosis.scan import Entry, ScanResult, Stack, log_bayes_factor, scan, stack_entries
-from robcal.physics.family import Constants, Family
-from robcal.transforms import Array
+from robcal.physics.family import Array, Constants, Family
 
 SAME_SIGNATURE = 0.98
 """Share of the named signature that a rival must reproduce to be called indistinguishable."""
@@ -50,7 +50,7 @@ def posterior(families: Sequence[Family], result: ScanResult) -> Posterior:
     order = np.argsort(result.family, kind="stable")
     bounds = np.searchsorted(result.family[order], np.arange(len(families) + 1))
     for f, family in enumerate(families):
-        rows = order[bounds[f]: bounds[f + 1]]
+        rows = order[bounds[f] : bounds[f + 1]]
         if len(rows) == 0:
             continue
         values = result.log_evidence[rows]
@@ -78,13 +78,15 @@ def refine(family: Family, constants: Constants, at: Tangents, fitted: Array, re
         return -float(log_bayes_factor(stack.singular, z[None, :])[0])
 
     start = np.array([constants[n] if family.continuous[n][0] <= 0 else np.log(constants[n]) for n in names])
-    spread = np.array([
-        0.02 * (family.continuous[n][1] - family.continuous[n][0]) if family.continuous[n][0] <= 0 else 0.3
-        for n in names
-    ])
+    spread = np.array(
+        [
+            0.02 * (family.continuous[n][1] - family.continuous[n][0]) if family.continuous[n][0] <= 0 else 0.3
+            for n in names
+        ]
+    )
     simplex = np.vstack([start, start + np.diag(spread)])
-    options = {"initial_simplex": simplex, "maxfev": 40 * len(names), "xatol": 1e-3, "fatol": 1e-3}
-    found = optimize.minimize(badness, start, method="Nelder-Mead", options=options)
+    options: Any = {"initial_simplex": simplex, "maxfev": 40 * len(names), "xatol": 1e-3, "fatol": 1e-3}
+    found: Any = optimize.minimize(badness, start, method="Nelder-Mead", options=options)
     if found.fun >= badness(start):
         return constants
     refined = dict(constants)
@@ -116,7 +118,11 @@ def overlap(stacks: Sequence[Stack], projected: Array, families: int) -> tuple[A
 
 
 def rivals(
-    families: Sequence[Family], named: int, ranked: Posterior, stacks: Sequence[Stack], projected: Array,
+    families: Sequence[Family],
+    named: int,
+    ranked: Posterior,
+    stacks: Sequence[Stack],
+    projected: Array,
     eligible: Array,
 ) -> tuple[Rival, ...]:
     """The rest of the 95 % set, and every eligible family with (nearly) the same signature and a fair evidence."""
@@ -133,9 +139,7 @@ def rivals(
         if ranked.log_weight[f] > ranked.log_weight[named] - 7.0:
             chosen.setdefault(int(f), int(share_grid[f]))
     chosen.pop(named, None)
-    found = [
-        Rival(families[f], families[f].grid[g], float(probability[f]), float(share[f])) for f, g in chosen.items()
-    ]
+    found = [Rival(families[f], families[f].grid[g], float(probability[f]), float(share[f])) for f, g in chosen.items()]
     return tuple(sorted(found, key=lambda rival: -rival.probability))
 
 

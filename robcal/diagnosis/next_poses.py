@@ -8,11 +8,10 @@ import numpy as np
 
 from robcal.diagnosis.recording import Fit, Recording
 from robcal.diagnosis.result import Finding
-from robcal.physics.family import Constants, Family
+from robcal.physics.family import Array, Constants, Family
 from robcal.robot.kernel import PoseInputs
 from robcal.robot.model import RobotModel
 from robcal.robot.terms import evaluate
-from robcal.transforms import Array
 
 COUNT = 15
 CANDIDATES = 400

@@ -15,8 +15,8 @@ from scipy import optimize
 
 from robcal.diagnosis.decorrelation import SharedNoise
 from robcal.diagnosis.recording import Accepted, Fit, Recording, fit
+from robcal.physics.family import Array
 from robcal.robot.model import RobotModel
-from robcal.transforms import Array
 
 
 @dataclass(frozen=True)

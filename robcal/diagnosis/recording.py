@@ -16,10 +16,10 @@ from robcal.calibration.observations import (
 from robcal.diagnosis.decorrelation import SharedNoise
 from robcal.diagnosis.scan import orthonormal_basis
 from robcal.errors import InvalidInput
-from robcal.physics.family import Constants, Family, ObservationData
+from robcal.physics.family import Array, Constants, Family, ObservationData
 from robcal.robot.kernel import Kernel, PoseInputs
 from robcal.robot.model import RobotModel, Term
-from robcal.transforms import Array, transform
+from robcal.transforms import transform
 
 SpatialObservations = FrameObservations | PointObservations | DistanceObservations | SensorPointObservations
 
@@ -98,9 +98,13 @@ class Recording:
         observations = _rows(self.observations, np.flatnonzero(keep[self.observations.pose]))
         observations = replace(observations, pose=number[observations.pose])
         return replace(
-            self, q=self.q[rows], payload=tuple(self.payload[i] for i in rows), names=tuple(self.names[i] for i in rows),
+            self,
+            q=self.q[rows],
+            payload=tuple(self.payload[i] for i in rows),
+            names=tuple(self.names[i] for i in rows),
             covariates={name: np.asarray(values)[rows] for name, values in self.covariates.items()},
-            observations=observations, shared=None,
+            observations=observations,
+            shared=None,
         )
 
 
@@ -198,16 +202,25 @@ def terms_of(accepted: Accepted, number: int) -> tuple[Term, ...]:
         groups.setdefault((basis.frame, basis.kind), []).append((basis.parameter, basis.expression))
     return tuple(
         Term(
-            name, frame, kind, " + ".join(f"{p}*({expression})" for p, expression in parts),
-            {p: values[p] for p, _ in parts}, cause=family.cause,
+            name,
+            frame,
+            kind,
+            " + ".join(f"{p}*({expression})" for p, expression in parts),
+            {p: values[p] for p, _ in parts},
+            cause=family.cause,
         )
         for (frame, kind), parts in groups.items()
     )
 
 
 def fit(
-    model: RobotModel, recording: Recording, free: Sequence[str], accepted: Sequence[Accepted] = (),
-    *, iterations: int = 8, statics: str = "converged",
+    model: RobotModel,
+    recording: Recording,
+    free: Sequence[str],
+    accepted: Sequence[Accepted] = (),
+    *,
+    iterations: int = 8,
+    statics: str = "converged",
 ) -> Fit:
     """Least squares of the free parameters and all accepted causes together, from the model's present values.
 
@@ -224,42 +237,56 @@ def fit(
     theta = np.array(kernel.theta0, dtype=float)
     direct = [item for item in accepted if item.family.displace is not None]
     obs = recording.observations
-    rows = len(obs.pose)
-    previous = np.inf
-    for _ in range(iterations):
+
+    def linearised() -> tuple[Array, Array, Array]:
         frames, J = kernel.frames_and_jacobian(theta, inputs, columns=columns)
         residual, jacobian = recording.linearise(frames, J)
         if direct:
             data = observation_data(recording, frames, kernel.variables(theta, inputs))
-            extra = [recording.whiten(item.family.displace(data, item.constants), frames) for item in direct]  # type: ignore[misc]
-            jacobian = np.concatenate([jacobian, *extra], axis=1)
-        step, size = solve(jacobian, residual)
-        theta[columns] += step[: len(columns)]
-        change = float(np.sum((jacobian[:, : len(columns)] @ step[: len(columns)]) ** 2))
+            shifts = [item.family.displace(data, item.constants) for item in direct if item.family.displace is not None]
+            jacobian = np.concatenate([jacobian, *(recording.whiten(shift, frames) for shift in shifts)], axis=1)
+        return frames, residual, jacobian
+
+    previous = np.inf
+    for _ in range(iterations):
+        _, residual, jacobian = linearised()
+        step = solve(jacobian, residual)[: len(columns)]
+        theta[columns] += step
+        change = float(np.sum((jacobian[:, : len(columns)] @ step) ** 2))
         if change < 1e-10 or abs(previous - change) < 1e-14:
             break
         previous = change
-    frames, J = kernel.frames_and_jacobian(theta, inputs, columns=columns)
-    residual, jacobian = recording.linearise(frames, J)
-    if direct:
-        data = observation_data(recording, frames, kernel.variables(theta, inputs))
-        extra = [recording.whiten(item.family.displace(data, item.constants), frames) for item in direct]  # type: ignore[misc]
-        jacobian = np.concatenate([jacobian, *extra], axis=1)
-    step, size = solve(jacobian, residual)
-    step[: len(columns)] = 0.0 if not direct else step[: len(columns)]
-    residual = residual - jacobian @ step
+    frames, residual, jacobian = linearised()
+    # displacements of observations are linear: their amplitudes follow from the last linear problem
+    linear = solve(jacobian, residual)[len(columns) :] if direct else np.zeros(0)
+    residual = residual - jacobian[:, len(columns) :] @ linear
     covariance = pseudo_covariance(jacobian)
     filled = model.with_parameters({name: float(theta[position[name]]) for name in names})
-    done = _amplitudes(accepted, direct, names, position, theta, step[len(columns):], covariance, len(columns))
+    done = _amplitudes(accepted, direct, names, position, theta, linear, covariance, len(columns))
     return Fit(
-        filled, kernel, theta, tuple(names), done, residual, jacobian, np.repeat(obs.pose, len(residual) // rows),
-        inputs, frames, covariance,
+        filled,
+        kernel,
+        theta,
+        tuple(names),
+        done,
+        residual,
+        jacobian,
+        np.repeat(obs.pose, len(residual) // len(obs.pose)),
+        inputs,
+        frames,
+        covariance,
     )
 
 
 def _amplitudes(
-    accepted: Sequence[Accepted], direct: Sequence[Accepted], names: Sequence[str], position: Mapping[str, int],
-    theta: Array, linear: Array, covariance: Array, first_direct: int,
+    accepted: Sequence[Accepted],
+    direct: Sequence[Accepted],
+    names: Sequence[str],
+    position: Mapping[str, int],
+    theta: Array,
+    linear: Array,
+    covariance: Array,
+    first_direct: int,
 ) -> tuple[Accepted, ...]:
     done = []
     offset = 0
@@ -267,7 +294,7 @@ def _amplitudes(
         width = len(item.names)
         if item.family.displace is not None:
             where = np.arange(first_direct + offset, first_direct + offset + width)
-            values = linear[offset: offset + width]
+            values = linear[offset : offset + width]
             offset += width
         else:
             full = item.family.frees or tuple(
@@ -279,12 +306,11 @@ def _amplitudes(
     return tuple(done)
 
 
-def solve(jacobian: Array, residual: Array) -> tuple[Array, Array]:
-    """Minimum-norm least-squares step, columns scaled to unit length first; also the column lengths."""
+def solve(jacobian: Array, residual: Array) -> Array:
+    """Minimum-norm least-squares step, columns scaled to unit length first."""
     size = np.linalg.norm(jacobian, axis=0)
     safe = np.where(size > 0, size, 1.0)
-    step = np.linalg.lstsq(jacobian / safe, residual, rcond=1e-10)[0]
-    return step / safe, size
+    return np.asarray(np.linalg.lstsq(jacobian / safe, residual, rcond=1e-10)[0] / safe)
 
 
 def pseudo_covariance(jacobian: Array) -> Array:

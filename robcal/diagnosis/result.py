@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from robcal.physics.family import Constants, Family
+from robcal.physics.family import Array, Constants, Family
 from robcal.robot.model import RobotModel
-from robcal.transforms import Array
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-from robcal.transforms import Array
+from robcal.physics.family import Array
 
 PRIOR_SCALES = (0.3, 1.0, 3.0)
 """Sizes of the prior amplitude over which the evidence is averaged."""
@@ -129,8 +129,12 @@ def stack_entries(entries: Sequence[Entry], fitted: Fitted) -> tuple[Stack, ...]
         basis = basis * seen[:, None, :]
         stacks.append(
             Stack(
-                np.array([entry.family for entry in group]), np.array([entry.grid for entry in group]),
-                basis, singular * seen, right, seen.sum(axis=1),
+                np.array([entry.family for entry in group]),
+                np.array([entry.grid for entry in group]),
+                basis,
+                singular * seen,
+                right,
+                seen.sum(axis=1),
             )
         )
     return tuple(stacks)

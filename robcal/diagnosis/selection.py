@@ -15,10 +15,8 @@ from robcal.diagnosis.analysis import Analysis, accepted_from, analyse, extend
 from robcal.diagnosis.naming import refine
 from robcal.diagnosis.recording import Accepted, Fit, Recording, fit
 from robcal.diagnosis.scan import orthonormal_basis
-from robcal.physics.family import Constants
+from robcal.physics.family import Array, Constants
 from robcal.robot.model import RobotModel
-from robcal.transforms import Array
-
 
 PLAUSIBLE_ELASTICITY = 3e-6
 PLAUSIBLE_DEVIATION = 1e-3
@@ -75,9 +73,16 @@ class Selection:
     blunders: tuple[tuple[int, int], ...]
 
 
+DEFAULTS = SelectionSettings()
+
+
 def select(
-    model: RobotModel, recording: Recording, free: tuple[str, ...], tied: frozenset[str],
-    settings: SelectionSettings = SelectionSettings(), tell: Callable[[str], None] = lambda text: None,
+    model: RobotModel,
+    recording: Recording,
+    free: tuple[str, ...],
+    tied: frozenset[str],
+    settings: SelectionSettings = DEFAULTS,
+    tell: Callable[[str], None] = lambda text: None,
 ) -> Selection:
     """Search for what is missing in a fitted model."""
     accepted: tuple[Accepted, ...] = ()
@@ -123,8 +128,13 @@ def select(
 
 
 def _extended(
-    model: RobotModel, recording: Recording, free: tuple[str, ...], look: Analysis,
-    barred: set[tuple[str, str, str | None]], settings: SelectionSettings, tell: Callable[[str], None],
+    model: RobotModel,
+    recording: Recording,
+    free: tuple[str, ...],
+    look: Analysis,
+    barred: set[tuple[str, str, str | None]],
+    settings: SelectionSettings,
+    tell: Callable[[str], None],
 ) -> Fit | None:
     """The fit with the best family added; families whose refit does not keep the linear promise are barred."""
     for _ in range(settings.most_futile):
@@ -195,8 +205,13 @@ def choose(look: Analysis, open_to: Array | None = None) -> tuple[int, Constants
 
 
 def _backward(
-    model: RobotModel, recording: Recording, free: tuple[str, ...], tied: frozenset[str], present: Fit,
-    p_values: list[float], settings: SelectionSettings,
+    model: RobotModel,
+    recording: Recording,
+    free: tuple[str, ...],
+    tied: frozenset[str],
+    present: Fit,
+    p_values: list[float],
+    settings: SelectionSettings,
 ) -> tuple[bool, tuple[Accepted, ...], list[float]]:
     """With all others in the model: is each cause still needed, and is its name still the best?"""
     accepted = list(present.accepted)
@@ -204,7 +219,7 @@ def _backward(
     changed = False
     k = 0
     while k < len(accepted) and len(accepted) > 1:
-        others = tuple(accepted[:k] + accepted[k + 1:])
+        others = tuple(accepted[:k] + accepted[k + 1 :])
         look = analyse(fit(model, recording, free, others), recording, tied, runs=settings.runs)
         if look.p_value > settings.level:
             accepted = list(look.fit.accepted)

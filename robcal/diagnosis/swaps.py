@@ -8,7 +8,7 @@ import numpy as np
 
 from robcal.calibration.observations import PointObservations
 from robcal.diagnosis.recording import Recording
-from robcal.transforms import Array
+from robcal.physics.family import Array
 
 LEAST_DEVIATION = 1e-3
 """Metres: mean length deviations below this are no matter of numbers."""

@@ -11,11 +11,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from robcal.transforms import Array
-
+Array = NDArray[Any]
+"""Real numbers, indices or masks: the diagnosis handles all three."""
 Constants = Mapping[str, float]
 Report = Callable[[Array, Constants], dict[str, object]]
 
@@ -138,7 +140,9 @@ def numeric_sigma(
     for name in numbers:
         jacobian = np.stack(slopes[name], axis=-1)
         deviations = np.sqrt(np.clip(np.einsum("ij,jk,ik->i", jacobian, covariance, jacobian), 0.0, None))
-        sigma[name] = float(deviations[0]) if len(flat[name]) == 1 and not isinstance(told[name], list) else [
-            float(v) for v in deviations
-        ]
+        sigma[name] = (
+            float(deviations[0])
+            if len(flat[name]) == 1 and not isinstance(told[name], list)
+            else [float(v) for v in deviations]
+        )
     return told, sigma

@@ -7,9 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from robcal.physics.family import PER_KNM, Basis, Constants, Family
+from robcal.physics.family import PER_KNM, Array, Basis, Constants, Family
 from robcal.physics.site import Joint, RobotSite, exponential_law
-from robcal.transforms import Array
 
 TORQUE_SCALES_NM = (5.0, 15.0, 50.0, 150.0, 500.0)
 THRESHOLDS_NM = (0.5, 5.0, 20.0, 80.0)
@@ -44,7 +43,12 @@ def _stiffness(site: RobotSite, joint: Joint) -> Iterator[Family]:
     linear_fitted = elastic in site.fitted
     if not linear_fitted and elastic not in site.tied:
         yield Family(
-            "joint_compliance", "robot", joint.where, LETTER[joint.own_angle], (elastic,), (3e-6,),
+            "joint_compliance",
+            "robot",
+            joint.where,
+            LETTER[joint.own_angle],
+            (elastic,),
+            (3e-6,),
             lambda v, c: {"compliance_deg_per_kNm": float(v[0]) * PER_KNM},
             "{where} gives way about its own axis by {compliance_deg_per_kNm:.3g} deg/kNm, which the model leaves out",
             frees=(elastic,),
@@ -60,7 +64,10 @@ def _stiffness(site: RobotSite, joint: Joint) -> Iterator[Family]:
         return {"linear_deg_per_kNm": first * PER_KNM, "cubic_deg_per_kNm3": float(v[0]) * np.degrees(1.0) * 1e9}
 
     yield Family(
-        "stiffness_nonlinear", "robot", joint.where, LETTER[joint.own_angle],
+        "stiffness_nonlinear",
+        "robot",
+        joint.where,
+        LETTER[joint.own_angle],
         ("cubic",) if linear_fitted else ("cubic", "linear"),
         (2e-4 / largest**3,) if linear_fitted else (2e-4 / largest**3, 3e-6),
         report,
@@ -100,10 +107,17 @@ def _backlash(site: RobotSite, joint: Joint) -> Iterator[Family]:
         return (Basis(joint.frame, "q", law, "width"),)
 
     yield Family(
-        "backlash", "robot", joint.where, LETTER[joint.own_angle], ("width",), (_lag(joint),),
+        "backlash",
+        "robot",
+        joint.where,
+        LETTER[joint.own_angle],
+        ("width",),
+        (_lag(joint),),
         lambda v, c: {name: float(v[0]) * joint.factor, **({"threshold_Nm": c["threshold_Nm"]} if c else {})},
         "{where} has {" + name + ":.4f} " + joint.unit + " of backlash the model does not know",
-        grid=grid, bases=bases, covariates=(f"approach{k}", f"torque{k}"),
+        grid=grid,
+        bases=bases,
+        covariates=(f"approach{k}", f"torque{k}"),
     )
 
 
@@ -113,7 +127,12 @@ def _hysteresis(site: RobotSite, joint: Joint) -> Iterator[Family]:
         return
     name = f"width_{joint.unit}"
     yield Family(
-        "hysteresis", "robot", joint.where, LETTER[joint.own_angle], ("width",), (_lag(joint),),
+        "hysteresis",
+        "robot",
+        joint.where,
+        LETTER[joint.own_angle],
+        ("width",),
+        (_lag(joint),),
         lambda v, c: {name: float(v[0]) * joint.factor},
         "{where} lags behind by {" + name + ":.4f} " + joint.unit + " between the two approach directions",
         bases=lambda c: (Basis(joint.frame, "q", f"-0.5*approach{k}", "width"),),
@@ -129,7 +148,12 @@ def _lost_motion(site: RobotSite, joint: Joint) -> Iterator[Family]:
         return
     scales = [s for s in TORQUE_SCALES_NM if 0.005 * largest < s < 1.5 * largest] or [0.3 * largest]
     yield Family(
-        "lost_motion", "robot", joint.where, LETTER[joint.own_angle], ("amplitude",), (2e-4,),
+        "lost_motion",
+        "robot",
+        joint.where,
+        LETTER[joint.own_angle],
+        ("amplitude",),
+        (2e-4,),
         lambda v, c: {"amplitude_deg": float(v[0]) * np.degrees(1.0), "torque_Nm": c["torque_Nm"]},
         "{where} loses {amplitude_deg:.4f} deg around zero load (lost motion, scale {torque_Nm:.0f} N m)",
         grid=tuple({"torque_Nm": s} for s in scales),
@@ -143,7 +167,12 @@ def _zero_jump(site: RobotSite, joint: Joint) -> Iterator[Family]:
     order = np.sort(site.variables["index"])
     name = f"jump_{joint.unit}"
     yield Family(
-        "zero_jump", "robot", joint.where, LETTER[joint.own_angle], ("jump",), (5e-4,),
+        "zero_jump",
+        "robot",
+        joint.where,
+        LETTER[joint.own_angle],
+        ("jump",),
+        (5e-4,),
         lambda v, c: {"pose": c["pose"], name: float(v[0]) * joint.factor},
         "The zero of {where} jumped by {" + name + ":.4f} " + joint.unit + " at pose {pose}",
         grid=tuple({"pose": float(i)} for i in order[2:-1]),
@@ -168,7 +197,13 @@ def _eccentricity(site: RobotSite, joint: Joint) -> Iterator[Family]:
         return {"order": int(c["order"]), "amplitude_deg": amplitude, "phase_deg": phase}
 
     yield Family(
-        "joint_eccentricity", "robot", joint.where, LETTER[joint.own_angle], ("cosine", "sine"), (3e-4, 3e-4), report,
+        "joint_eccentricity",
+        "robot",
+        joint.where,
+        LETTER[joint.own_angle],
+        ("cosine", "sine"),
+        (3e-4, 3e-4),
+        report,
         "The encoder or gear of {where} runs out of centre: {amplitude_deg:.4f} deg, order {order}",
         grid=({"order": 1.0}, {"order": 2.0}),
         bases=lambda c: _harmonic(joint.number, joint.frame, "q", c["order"]),
@@ -187,7 +222,13 @@ def _ripple(site: RobotSite, joint: Joint) -> Iterator[Family]:
         return {"order": order, "amplitude_deg": amplitude, "phase_deg": phase}
 
     yield Family(
-        "gear_ripple", "robot", joint.where, LETTER[joint.own_angle], ("cosine", "sine"), (1e-4, 1e-4), report,
+        "gear_ripple",
+        "robot",
+        joint.where,
+        LETTER[joint.own_angle],
+        ("cosine", "sine"),
+        (1e-4, 1e-4),
+        report,
         "The gear of {where} ripples {order:g} times a turn with {amplitude_deg:.4f} deg",
         grid=tuple({"order": float(o)} for o in range(3, HIGHEST_RIPPLE_ORDER + 1)),
         bases=lambda c: _harmonic(joint.number, joint.frame, "q", c["order"]),
@@ -198,7 +239,12 @@ def _ripple(site: RobotSite, joint: Joint) -> Iterator[Family]:
 def _ratio(site: RobotSite, joint: Joint) -> Iterator[Family]:
     k = joint.number
     yield Family(
-        "transmission_ratio", "robot", joint.where, LETTER[joint.own_angle], ("ratio",), (2e-4,),
+        "transmission_ratio",
+        "robot",
+        joint.where,
+        LETTER[joint.own_angle],
+        ("ratio",),
+        (2e-4,),
         lambda v, c: {"ratio_error_ppm": float(v[0]) * 1e6},
         "The transmission of {where} turns {ratio_error_ppm:.0f} ppm more than its ratio says",
         bases=lambda c: (Basis(joint.frame, "q", f"q{k}", "ratio"),),
@@ -218,9 +264,16 @@ def _coupling(joint: Joint, joints: list[Joint]) -> Iterator[Family]:
             return {"from": where, "ratio": float(v[0])}
 
         yield Family(
-            "joint_coupling", "robot", joint.where, LETTER[joint.own_angle], ("ratio",), (3e-4,), report,
+            "joint_coupling",
+            "robot",
+            joint.where,
+            LETTER[joint.own_angle],
+            ("ratio",),
+            (3e-4,),
+            report,
             "{where} is dragged along by {from}: {ratio:.2e} of its angle",
-            bases=bases, covariates=(f"q{driver.number}",),
+            bases=bases,
+            covariates=(f"q{driver.number}",),
         )
 
 
@@ -244,10 +297,18 @@ def _counterbalance(site: RobotSite, joints: list[Joint]) -> Iterator[Family]:
 
         size = max(0.2 * largest, 1.0)
         yield Family(
-            "counterbalance", "robot", joint.where, LETTER[joint.own_angle], ("cosine", "sine"), (size, size), report,
+            "counterbalance",
+            "robot",
+            joint.where,
+            LETTER[joint.own_angle],
+            ("cosine", "sine"),
+            (size, size),
+            report,
             "A balancing torque of {torque_Nm:.0f} N m acts on {where} that the model does not know",
             # balancing cylinders and springs hang at the joint with the largest torque
-            bases=bases, covariates=(f"q{joint.number}",), weight=0.7 if rank == 0 else 0.3 / (len(loaded) - 1),
+            bases=bases,
+            covariates=(f"q{joint.number}",),
+            weight=0.7 if rank == 0 else 0.3 / (len(loaded) - 1),
         )
 
 
@@ -259,20 +320,33 @@ def _zero_drift(site: RobotSite, joint: Joint) -> Iterator[Family]:
             return (Basis(joint.frame, "q", law, "drift"),)
 
         yield Family(
-            "thermal_zero_drift", "robot", joint.where, LETTER[joint.own_angle], ("drift",), (3e-5,),
+            "thermal_zero_drift",
+            "robot",
+            joint.where,
+            LETTER[joint.own_angle],
+            ("drift",),
+            (3e-5,),
             lambda v, c: {f"{joint.unit}_per_K": float(v[0]) * joint.factor},
             "The zero of {where} drifts by {" + f"{joint.unit}_per_K" + ":.5f} " + joint.unit + " per kelvin",
-            bases=bases, covariates=(name,), weight=0.5,
+            bases=bases,
+            covariates=(name,),
+            weight=0.5,
         )
     duration = site.duration_h()
     if duration > 0:
         start = float(np.min(site.variables["time_s"]))
         yield Family(
-            "thermal_zero_drift", "robot", joint.where, LETTER[joint.own_angle], ("drift",), (3e-4 / duration,),
+            "thermal_zero_drift",
+            "robot",
+            joint.where,
+            LETTER[joint.own_angle],
+            ("drift",),
+            (3e-4 / duration,),
             lambda v, c: {f"{joint.unit}_per_h": float(v[0]) * joint.factor, "tau_h": c["tau_h"]},
             "The zero of {where} drifts by {" + f"{joint.unit}_per_h" + ":.5f} " + joint.unit + " per hour",
             grid=tuple({"tau_h": share * duration} for share in (0.1, 0.25, 0.6, 3.0)),
             continuous={"tau_h": (0.02 * duration, 10.0 * duration)},
             bases=lambda c: (Basis(joint.frame, "q", exponential_law(start, duration, c["tau_h"]), "drift"),),
-            covariates=("time_s",), weight=0.5,
+            covariates=("time_s",),
+            weight=0.5,
         )

@@ -12,8 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from robcal.physics.family import DEG, Constants, Family, ObservationData
-from robcal.transforms import Array
+from robcal.physics.family import DEG, Array, Constants, Family, ObservationData
 
 STEEL_WIRE_N = 5.0
 """Tension that a draw-wire encoder typically keeps up (makers' data sheets: 2 to 10 N); sag scales with its inverse."""
@@ -74,9 +73,13 @@ def _positions(data: ObservationData) -> Array:
 
 
 def _station(data: ObservationData) -> Iterator[Family]:
-    p = _positions(data)
     scale = Family(
-        "scale_error", "camera", "station", None, ("scale",), (1e-4,),
+        "scale_error",
+        "camera",
+        "station",
+        None,
+        ("scale",),
+        (1e-4,),
         lambda v, c: {"ppm": float(v[0]) * 1e6},
         "The station measures lengths {ppm:.0f} ppm too long",
         displace=lambda d, c: _world(d, _positions(d)[:, :, None]),
@@ -89,15 +92,24 @@ def _station(data: ObservationData) -> Iterator[Family]:
             return _world(d, _positions(d)[:, :, None] * change(d))
 
         yield replace(
-            scale, cause="scale_drift", priors=(2e-5,), report=lambda v, c: {"ppm_per_K": float(v[0]) * 1e6},
-            sentence="The scale of the station drifts by {ppm_per_K:.1f} ppm per kelvin", displace=drift,
-            covariates=(name,), weight=0.5,
+            scale,
+            cause="scale_drift",
+            priors=(2e-5,),
+            report=lambda v, c: {"ppm_per_K": float(v[0]) * 1e6},
+            sentence="The scale of the station drifts by {ppm_per_K:.1f} ppm per kelvin",
+            displace=drift,
+            covariates=(name,),
+            weight=0.5,
         )
     clock = _clock(data)
     if clock is not None:
         duration, course = clock
         yield replace(
-            scale, cause="scale_drift", priors=(1e-4 / duration,), covariates=("time_s",), weight=0.5,
+            scale,
+            cause="scale_drift",
+            priors=(1e-4 / duration,),
+            covariates=("time_s",),
+            weight=0.5,
             report=lambda v, c: {"ppm_per_h": float(v[0]) * 1e6, "tau_h": c["tau_h"]},
             sentence="The scale of the station drifts by {ppm_per_h:.1f} ppm per hour",
             grid=tuple({"tau_h": share * duration} for share in (0.1, 0.25, 0.6, 3.0)),
@@ -115,13 +127,21 @@ def _station(data: ObservationData) -> Iterator[Family]:
         return _world(d, shift * after, np.concatenate([np.zeros_like(turn), turn], axis=2) * after)
 
     yield Family(
-        "camera_moved", "camera", "station", None, ("x", "y", "z", "rx", "ry", "rz"),
+        "camera_moved",
+        "camera",
+        "station",
+        None,
+        ("x", "y", "z", "rx", "ry", "rz"),
         (1e-3, 1e-3, 1e-3, 5e-4, 5e-4, 5e-4),
         lambda v, c: {
-            "pose": c["pose"], "shift_mm": [float(x) * 1e3 for x in v[:3]], "turn_deg": [float(x) * DEG for x in v[3:]],
+            "pose": c["pose"],
+            "shift_mm": [float(x) * 1e3 for x in v[:3]],
+            "turn_deg": [float(x) * DEG for x in v[3:]],
         },
         "The station moved before pose {pose}",
-        grid=tuple({"pose": float(i)} for i in order[3:-3]), displace=moved, covariates=("index",),
+        grid=tuple({"pose": float(i)} for i in order[3:-3]),
+        displace=moved,
+        covariates=("index",),
     )
 
 
@@ -140,12 +160,18 @@ def _body(data: ObservationData, ids: tuple[int, ...], body: str) -> Iterator[Fa
             return d.world_T_tool[:, :3, :3] * (d.target == t)[:, None, None]
 
         yield Family(
-            "target_shifted", "body", str(target), None, ("x", "y", "z"), (5e-4, 5e-4, 5e-4),
+            "target_shifted",
+            "body",
+            str(target),
+            None,
+            ("x", "y", "z"),
+            (5e-4, 5e-4, 5e-4),
             lambda v, c: {"shift_mm": [float(x) * 1e3 for x in v]},
             "Target {where} sits at another place than its file says, by {shift_mm} mm",
-            displace=shifted, weight=1.0 / len(present),
+            displace=shifted,
+            weight=1.0 / len(present),
         )
-    pairs = [(i, j) for k, i in enumerate(present) for j in present[k + 1:]]
+    pairs = [(i, j) for k, i in enumerate(present) for j in present[k + 1 :]]
     yield from (replace(swapped(data, i, j), weight=1.0 / len(pairs)) for i, j in pairs)
     for name, change in _temperatures(data):
 
@@ -153,10 +179,16 @@ def _body(data: ObservationData, ids: tuple[int, ...], body: str) -> Iterator[Fa
             return np.einsum("mij,mj->mi", d.world_T_tool[:, :3, :3], d.p_tool)[:, :, None] * change(d)
 
         yield Family(
-            "body_thermal_growth", "body", body, None, ("growth",), (1.5e-5,),
+            "body_thermal_growth",
+            "body",
+            body,
+            None,
+            ("growth",),
+            (1.5e-5,),
             lambda v, c: {"um_per_m_K": float(v[0]) * 1e6},
             "The measuring body {where} grows by {um_per_m_K:.1f} um per metre and kelvin",
-            displace=grown, covariates=(name,),
+            displace=grown,
+            covariates=(name,),
         )
 
 
@@ -170,8 +202,15 @@ def swapped(data: ObservationData, i: int, j: int) -> Family:
         return np.einsum("mij,mj->mi", d.world_T_tool[:, :3, :3], step)[:, :, None]
 
     return Family(
-        "target_swapped", "body", str(i), None, ("share",), (1.0,), lambda v, c: {"with": j},
-        f"Targets {i} and {j} carry each other's number", displace=displace,
+        "target_swapped",
+        "body",
+        str(i),
+        None,
+        ("share",),
+        (1.0,),
+        lambda v, c: {"with": j},
+        f"Targets {i} and {j} carry each other's number",
+        displace=displace,
     )
 
 
@@ -181,8 +220,14 @@ def _wire() -> Iterator[Family]:
 
     def family(cause: str, prior: float, report: str, factor: float, sentence: str, law: object) -> Family:
         return Family(
-            cause, "wire", "wire", None, ("amount",), (prior,),
-            lambda v, c: {report: float(v[0]) * factor}, sentence,
+            cause,
+            "wire",
+            "wire",
+            None,
+            ("amount",),
+            (prior,),
+            lambda v, c: {report: float(v[0]) * factor},
+            sentence,
             displace=lambda d, c: law(d)[:, None, None],  # type: ignore[operator]
         )
 
@@ -195,26 +240,49 @@ def _wire() -> Iterator[Family]:
         family("wire_sag", 1e-6, "g_per_m", 1.0, "The wire sags as one of {g_per_m:.1f} g/m does", sag),
         report=lambda v, c: {"g_per_m": float(np.sqrt(max(v[0], 0.0))) * 1e3},
     )
-    yield family("wire_stretch", 1e-4, "ppm_per_m", 1e6, "The wire stretches by {ppm_per_m:.0f} ppm per metre drawn",
-                 lambda d: length(d) ** 2)
+    yield family(
+        "wire_stretch",
+        1e-4,
+        "ppm_per_m",
+        1e6,
+        "The wire stretches by {ppm_per_m:.0f} ppm per metre drawn",
+        lambda d: length(d) ** 2,
+    )
     yield family("wire_scale", 3e-4, "ppm", 1e6, "The wire encoder counts {ppm:.0f} ppm too much", length)
-    yield family("wire_offset", 1e-3, "mm", 1e3, "The wire's zero is off by {mm:.2f} mm",
-                 lambda d: np.ones(len(d.pose)))
-    yield family("pulley_wrap", 5e-3, "radius_mm", 1e3,
-                 "The wire wraps around a pulley of {radius_mm:.1f} mm radius that the model leaves out",
-                 lambda d: np.arctan2(d.p_world[:, 2], np.hypot(d.p_world[:, 0], d.p_world[:, 1])))
+    yield family(
+        "wire_offset", 1e-3, "mm", 1e3, "The wire's zero is off by {mm:.2f} mm", lambda d: np.ones(len(d.pose))
+    )
+    yield family(
+        "pulley_wrap",
+        5e-3,
+        "radius_mm",
+        1e3,
+        "The wire wraps around a pulley of {radius_mm:.1f} mm radius that the model leaves out",
+        lambda d: np.arctan2(d.p_world[:, 2], np.hypot(d.p_world[:, 0], d.p_world[:, 1])),
+    )
 
 
 def _sensor(data: ObservationData, body: str) -> Iterator[Family]:
     if data.p_sensor is None:
         return
     yield Family(
-        "sensor_scale", "sensor", "sensor", None, ("scale",), (1e-3,), lambda v, c: {"ppm": float(v[0]) * 1e6},
+        "sensor_scale",
+        "sensor",
+        "sensor",
+        None,
+        ("scale",),
+        (1e-3,),
+        lambda v, c: {"ppm": float(v[0]) * 1e6},
         "The sensor measures {ppm:.0f} ppm too long",
-        displace=lambda d, c: np.einsum("mij,mj->mi", d.world_T_tool[:, :3, :3], d.p_sensor)[:, :, None],
+        displace=lambda d, c: np.einsum("mij,mj->mi", d.world_T_tool[:, :3, :3], _required(d.p_sensor))[:, :, None],
     )
     yield Family(
-        "sensor_rotation", "sensor", "sensor", None, ("rx", "ry", "rz"), (2e-3, 2e-3, 2e-3),
+        "sensor_rotation",
+        "sensor",
+        "sensor",
+        None,
+        ("rx", "ry", "rz"),
+        (2e-3, 2e-3, 2e-3),
         lambda v, c: {"deg": [float(x) * DEG for x in v]},
         "The sensor's axes are turned by {deg} deg",
         displace=lambda d, c: d.world_T_tool[:, :3, :3] @ _cross_columns(_required(d.p_sensor)),
@@ -225,8 +293,15 @@ def _sensor(data: ObservationData, body: str) -> Iterator[Family]:
             return -d.p_world[:, :, None] * change(d)
 
         yield Family(
-            "sphere_growth", "sensor", body, None, ("growth",), (1e-5,), lambda v, c: {"um_per_m_K": float(v[0]) * 1e6},
-            "The calibration sphere grows by {um_per_m_K:.1f} um per metre and kelvin", displace=grown,
+            "sphere_growth",
+            "sensor",
+            body,
+            None,
+            ("growth",),
+            (1e-5,),
+            lambda v, c: {"um_per_m_K": float(v[0]) * 1e6},
+            "The calibration sphere grows by {um_per_m_K:.1f} um per metre and kelvin",
+            displace=grown,
             covariates=(name,),
         )
 

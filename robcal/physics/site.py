@@ -7,9 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from robcal.physics.family import DEG
+from robcal.physics.family import DEG, Array
 from robcal.robot.model import RobotModel
-from robcal.transforms import Array
 
 ANGLE_OF_AXIS = {"x": "roll", "y": "pitch", "z": "yaw"}
 LETTER_OF_KIND = {"roll": "x", "pitch": "y", "yaw": "z", "x": "x", "y": "y", "z": "z"}

@@ -7,10 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from robcal.physics.family import DEG, PER_KNM, Basis, Constants, Family
+from robcal.physics.family import DEG, PER_KNM, Array, Basis, Constants, Family, Report
 from robcal.physics.site import LETTER_OF_KIND, Joint, RobotSite, exponential_law
 from robcal.robot.terms import identifier
-from robcal.transforms import Array
 
 
 def structure_families(site: RobotSite) -> Iterator[Family]:
@@ -30,10 +29,16 @@ def _link_compliance(site: RobotSite, joint: Joint) -> Iterator[Family]:
         if name in site.fitted or name in site.tied or not site.varies(f"{identifier(joint.frame)}_m{angle}", 1.0):
             continue
         yield Family(
-            "link_compliance", "robot", joint.where, LETTER_OF_KIND[angle], (name,), (1e-6,),
+            "link_compliance",
+            "robot",
+            joint.where,
+            LETTER_OF_KIND[angle],
+            (name,),
+            (1e-6,),
             lambda v, c: {"compliance_deg_per_kNm": float(v[0]) * PER_KNM},
             "The link or bearing of {where} gives way about {direction} by {compliance_deg_per_kNm:.3g} deg/kNm",
-            frees=(name,), covariates=(f"{identifier(joint.frame)}_m{angle}",),
+            frees=(name,),
+            covariates=(f"{identifier(joint.frame)}_m{angle}",),
         )
 
 
@@ -49,7 +54,13 @@ def _geometry(site: RobotSite, joint: Joint) -> Iterator[Family]:
             return {key: float(v[0]) * scale}
 
         yield Family(
-            "geometry", "robot", joint.where, LETTER_OF_KIND[kind], (name,), (5e-4,), report,
+            "geometry",
+            "robot",
+            joint.where,
+            LETTER_OF_KIND[kind],
+            (name,),
+            (5e-4,),
+            report,
             f"The {kind} of {{where}} is off by {{{kind}_{unit}:.4f}} {unit}, which the model held fixed",
             frees=(name,),
         )
@@ -62,7 +73,10 @@ def _wobble(site: RobotSite, joint: Joint) -> Iterator[Family]:
 
         def bases(c: Constants, kind: str = angle) -> tuple[Basis, ...]:
             turn = f"{c['order']!r}*q{joint.number}"
-            return (Basis(joint.frame, kind, f"cos({turn})", "cosine"), Basis(joint.frame, kind, f"sin({turn})", "sine"))
+            return (
+                Basis(joint.frame, kind, f"cos({turn})", "cosine"),
+                Basis(joint.frame, kind, f"sin({turn})", "sine"),
+            )
 
         def report(v: Array, c: Constants) -> dict[str, object]:
             return {
@@ -72,9 +86,17 @@ def _wobble(site: RobotSite, joint: Joint) -> Iterator[Family]:
             }
 
         yield Family(
-            "axis_wobble", "robot", joint.where, LETTER_OF_KIND[angle], ("cosine", "sine"), (2e-4, 2e-4), report,
+            "axis_wobble",
+            "robot",
+            joint.where,
+            LETTER_OF_KIND[angle],
+            ("cosine", "sine"),
+            (2e-4, 2e-4),
+            report,
             "The axis of {where} wobbles about {direction} by {amplitude_deg:.4f} deg, {order} times a turn",
-            grid=({"order": 1.0}, {"order": 2.0}, {"order": 3.0}), bases=bases, covariates=(f"q{joint.number}",),
+            grid=({"order": 1.0}, {"order": 2.0}, {"order": 3.0}),
+            bases=bases,
+            covariates=(f"q{joint.number}",),
         )
 
 
@@ -87,50 +109,83 @@ def _growth(site: RobotSite, joint: Joint) -> Iterator[Family]:
         for name in site.temperatures():
             first = float(site.variables[name][int(np.argmin(site.variables["index"]))])
 
-            def warm(c: Constants, axis: str = axis, law: str = f"{length!r}*({name} - {first!r})") -> tuple[Basis, ...]:
+            law = f"{length!r}*({name} - {first!r})"
+
+            def warm(c: Constants, axis: str = axis, law: str = law) -> tuple[Basis, ...]:
                 return (Basis(joint.frame, axis, law, "growth"),)
 
             yield Family(
-                "thermal_growth", "robot", joint.where, axis, ("growth",), (1.5e-5,),
+                "thermal_growth",
+                "robot",
+                joint.where,
+                axis,
+                ("growth",),
+                (1.5e-5,),
                 lambda v, c: {"um_per_m_K": float(v[0]) * 1e6},
                 "The link of {where} grows along {direction} by {um_per_m_K:.1f} um per metre and kelvin",
-                bases=warm, covariates=(name,),
+                bases=warm,
+                covariates=(name,),
             )
         duration = site.duration_h()
         if duration > 0:
             start = float(np.min(site.variables["time_s"]))
 
-            def slow(c: Constants, axis: str = axis, sign: float = np.sign(length)) -> tuple[Basis, ...]:
+            def slow(
+                c: Constants,
+                axis: str = axis,
+                sign: float = float(np.sign(length)),
+                start: float = start,
+                duration: float = duration,
+            ) -> tuple[Basis, ...]:
                 law = exponential_law(start, duration, c["tau_h"])
-                return (Basis(joint.frame, axis, f"{float(sign)!r}*{law}", "growth"),)
+                return (Basis(joint.frame, axis, f"{sign!r}*{law}", "growth"),)
 
             yield Family(
-                "thermal_growth", "robot", joint.where, axis, ("growth",), (2e-4 / duration,),
+                "thermal_growth",
+                "robot",
+                joint.where,
+                axis,
+                ("growth",),
+                (2e-4 / duration,),
                 lambda v, c: {"rate_um_per_h": float(v[0]) * 1e6, "tau_h": c["tau_h"]},
                 "The link of {where} grows along {direction} by {rate_um_per_h:.1f} um per hour",
                 grid=tuple({"tau_h": share * duration} for share in (0.1, 0.25, 0.6, 3.0)),
                 continuous={"tau_h": (0.02 * duration, 10.0 * duration)},
-                bases=slow, covariates=("time_s",),
+                bases=slow,
+                covariates=("time_s",),
             )
 
 
 def _base(site: RobotSite) -> Iterator[Family]:
     if any(site.varies(f"base_m{axis}", 1.0) for axis in "xy"):
         yield Family(
-            "base_compliance", "robot", "base", None, ("compliance",), (3e-7,),
+            "base_compliance",
+            "robot",
+            "base",
+            None,
+            ("compliance",),
+            (3e-7,),
             lambda v, c: {"compliance_deg_per_kNm": float(v[0]) * PER_KNM},
             "The foundation tilts under the overturning moment by {compliance_deg_per_kNm:.3g} deg/kNm",
             bases=lambda c: (
-                Basis("base", "roll", "base_mx", "compliance"), Basis("base", "pitch", "base_my", "compliance"),
+                Basis("base", "roll", "base_mx", "compliance"),
+                Basis("base", "pitch", "base_my", "compliance"),
             ),
             covariates=("base_mx", "base_my"),
         )
     order = np.sort(site.variables["index"])
     kinds = ("x", "y", "z", "roll", "pitch", "yaw")
     yield Family(
-        "base_moved", "robot", "base", None, kinds, (1e-3, 1e-3, 1e-3, 5e-4, 5e-4, 5e-4),
+        "base_moved",
+        "robot",
+        "base",
+        None,
+        kinds,
+        (1e-3, 1e-3, 1e-3, 5e-4, 5e-4, 5e-4),
         lambda v, c: {
-            "pose": c["pose"], "shift_mm": [float(x) * 1e3 for x in v[:3]], "turn_deg": [float(x) * DEG for x in v[3:]],
+            "pose": c["pose"],
+            "shift_mm": [float(x) * 1e3 for x in v[:3]],
+            "turn_deg": [float(x) * DEG for x in v[3:]],
         },
         "The base of the robot moved before pose {pose}",
         grid=tuple({"pose": float(i)} for i in order[3:-3]),
@@ -147,11 +202,18 @@ def _gravity(site: RobotSite) -> Iterator[Family]:
     def report(v: Array, c: Constants) -> dict[str, object]:
         # a turn (tx, ty) of the downward vector leans it towards x by -ty and towards y by tx
         return {
-            "tilt_deg": float(np.hypot(*v)) * DEG, "azimuth_deg": float(np.degrees(np.arctan2(v[0], -v[1]))),
+            "tilt_deg": float(np.hypot(*v)) * DEG,
+            "azimuth_deg": float(np.degrees(np.arctan2(v[0], -v[1]))),
         }
 
     yield Family(
-        "base_tilt", "robot", "base", None, names, (0.02, 0.02), report,
+        "base_tilt",
+        "robot",
+        "base",
+        None,
+        names,
+        (0.02, 0.02),
+        report,
         "The base stands {tilt_deg:.2f} deg off the plumb line, which changes the deflections",
         frees=names,
     )
@@ -168,18 +230,34 @@ def _payloads(site: RobotSite) -> Iterator[Family]:
         mass_name = f"payload.{name}.mass"
         if mass_name in site.fitted:
             continue
-        mass = payload.mass
         yield Family(
-            "payload_mass", "robot", name, None, (mass_name,), (max(0.15 * mass, 0.5),),
-            lambda v, c, m=mass: {"mass_kg": m + float(v[0])},  # type: ignore[misc]
+            "payload_mass",
+            "robot",
+            name,
+            None,
+            (mass_name,),
+            (max(0.15 * payload.mass, 0.5),),
+            _mass_report(payload.mass),
             "Payload {where} weighs {mass_kg:.1f} kg, not what the campaign says",
             frees=(mass_name,),
         )
         cog_names = tuple(f"payload.{name}.{axis}" for axis in "xyz")
-        cog = np.array(payload.cog)
         yield Family(
-            "payload_cog", "robot", name, None, cog_names, (0.1, 0.1, 0.1),
-            lambda v, c, g=cog: {"cog_mm": [float(x) * 1e3 for x in g + v]},  # type: ignore[misc]
+            "payload_cog",
+            "robot",
+            name,
+            None,
+            cog_names,
+            (0.1, 0.1, 0.1),
+            _cog_report(np.array(payload.cog)),
             "The centre of gravity of payload {where} lies at {cog_mm} mm, not where the campaign says",
             frees=cog_names,
         )
+
+
+def _mass_report(stated: float) -> Report:
+    return lambda v, c: {"mass_kg": stated + float(v[0])}
+
+
+def _cog_report(stated: Array) -> Report:
+    return lambda v, c: {"cog_mm": [float(x) * 1e3 for x in stated + v]}
