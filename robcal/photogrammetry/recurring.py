@@ -127,6 +127,8 @@ def find_recurring(
     deviation = d_mean - d_file
     scale, scale_sigma = _common_scale(deviation, d_file, s)
     left = deviation - scale * d_file
+    scale_sigma *= _inflation(left / s)
+    s = s * _inflation(left / s)
     if not (
         abs(scale) > _SIGNIFICANT * scale_sigma
         and np.sum(np.abs(left) > _SIGNIFICANT * s) < 0.5 * np.sum(np.abs(deviation) > _SIGNIFICANT * s)
@@ -159,6 +161,15 @@ def find_recurring(
     )  # fmt: skip
 
 
+def _inflation(z: Array) -> float:
+    """By how much the better fifth of normalised deviations is larger than it should be, at least 1.
+
+    A body of modest accuracy, or a lens not fully modelled, moves all lengths a little in every pose; a wrong target
+    must stand out from that. The lowest fifth is free of two wrong targets among five.
+    """
+    return max(1.0, float(np.quantile(np.abs(z), 0.2)) / 0.2533) if len(z) >= 5 else 1.0
+
+
 def _off_the_plane(
     body: Body, mean: Array, sigma: Array, stay: IntArray, scale: float, shared: float
 ) -> IntArray:
@@ -168,7 +179,7 @@ def _off_the_plane(
     """
     stay = stay.copy()
     while len(stay) >= 5:
-        worst, which = 0.0, -1
+        sizes, worst, which = [], 0.0, -1
         for i in stay:
             others = stay[stay != i]
             if line_ratio(body.points[others]) < 0.02:
@@ -176,9 +187,11 @@ def _off_the_plane(
             moved = transform(fit_frame(body.points[others], mean[others] / scale), mean[i] / scale)
             C = np.diag(sigma[i] ** 2 + np.mean(sigma[others] ** 2, axis=0)) + 2 * body.marginal(i) + shared * np.eye(3)
             size = float((moved - body.points[i]) @ np.linalg.solve(C, moved - body.points[i]))
+            sizes.append(size)
             if size > worst:
                 worst, which = size, int(i)
-        if worst < _SIGNIFICANT**2 + 3 * len(stay):
+        typical = max(1.0, float(np.median(sizes)) / 2.37) if sizes else 1.0
+        if worst < (_SIGNIFICANT**2 + 3 * len(stay)) * typical:
             break
         stay = stay[stay != which]
     return stay

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from robcal.errors import DegenerateGeometry, InvalidInput
+from robcal.errors import DegenerateGeometry, InvalidInput, NotIdentifiable
 from robcal.photogrammetry.bodies import Body
 from robcal.photogrammetry.camera import Camera
 from robcal.photogrammetry.station_adjustment import Adjusted, covariance_blocks, interior_basis, interior_offset
@@ -71,10 +71,9 @@ def orient_station(
     stated = dict(world_T_camera or {})
     marks = [_usable(name, observations[name], body) for name in names]
     start = [
-        given if (given := cameras.get(n)) is not None
-        else focal_start(m, body, sizes[n], options.default_sigma_px)
+        given if (given := cameras.get(n)) is not None else _self_calibrated(n, m, body, sizes[n], options, len(names))
         for n, m in zip(names, marks, strict=True)
-    ]  # fmt: skip
+    ]
     images, failed = resect_station(names, marks, start, body, options.default_sigma_px)
     if not images:
         reason = failed[0][2] if failed else "no marks"
@@ -107,6 +106,20 @@ def orient_station(
     evidence += [*cleaned.evidence, *_lens_evidence(state, adjusted, cameras)]
     left = _tell_recurring([*rejected, *cleaned.rejected, *outliers], marks)
     return _result(state, adjusted, tuple(sorted(ambiguous)), tuple(evidence), left)
+
+
+def _self_calibrated(
+    name: str, marks: StationMarks, body: Body, size: tuple[int, int], options: StationSettings, cameras: int
+) -> Camera:
+    """Start values of a camera without a file: from the image size; in a station of several, by itself first."""
+    start = focal_start(marks, body, size, options.default_sigma_px)
+    if cameras == 1:
+        return start
+    alone = replace(options, intrinsics="auto", detect_moves=False, detect_targets=False, epochs={})
+    try:
+        return orient_station({name: marks}, body, {name: None}, {name: size}, settings=alone).cameras[0]
+    except NotIdentifiable:  # one camera alone may see too little (frontal views only); the others will help
+        return start
 
 
 def _swap_evidence(body: Body, i: int, j: int) -> Evidence:

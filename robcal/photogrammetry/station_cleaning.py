@@ -172,28 +172,29 @@ def snoop(state: StationState) -> tuple[Adjusted, tuple[RejectedMark, ...]]:
     """
     rejected: list[RejectedMark] = []
     limit = float(stats.chi2.isf(2 * stats.norm.sf(state.settings.critical), 2))
-    state.update_noise(state.adjust(None), robust=True)
-    adjusted = state.adjust(None)
-    for _ in range(25):
-        T2 = mark_statistic(adjusted.design.residual, state.redundancy(adjusted))
-        image = state.marks.camera * len(state.poses) + state.marks.pose
-        worst = np.zeros(int(image.max()) + 1)
-        np.maximum.at(worst, image, T2)
-        out = (T2 > limit) & (T2 == worst[image])
-        if not out.any():
-            break
-        for i in np.flatnonzero(out):
-            rejected.append(
-                RejectedMark(
-                    state.names[state.marks.camera[i]],
-                    int(state.poses[state.marks.pose[i]]),
-                    int(state.body.ids[state.marks.target[i]]),
-                    f"residual {np.sqrt(T2[i]):.1f} standard deviations",
-                )
-            )
-        state.drop(out)
+    # Gross errors are told by the median's scale, which they do not spoil; what is merely large is then judged by the
+    # root mean square, so that measurements with somewhat long tails are not thinned out.
+    for robust, level in ((True, 4.0 * limit), (False, limit)):
+        state.update_noise(state.adjust(None), robust=robust)
         adjusted = state.adjust(None)
-        state.update_noise(adjusted, robust=True)
+        for _ in range(20):
+            T2 = mark_statistic(adjusted.design.residual, state.redundancy(adjusted))
+            image = state.marks.camera * len(state.poses) + state.marks.pose
+            worst = np.zeros(int(image.max()) + 1)
+            np.maximum.at(worst, image, T2)
+            out = (T2 > level) & (T2 == worst[image])
+            if not out.any():
+                break
+            rejected += [
+                RejectedMark(
+                    state.names[state.marks.camera[i]], int(state.poses[state.marks.pose[i]]),
+                    int(state.body.ids[state.marks.target[i]]), f"residual {np.sqrt(T2[i]):.1f} standard deviations",
+                )
+                for i in np.flatnonzero(out)
+            ]  # fmt: skip
+            state.drop(out)
+            adjusted = state.adjust(None)
+            state.update_noise(adjusted, robust=robust)
     for _ in range(3):
         state.update_noise(adjusted, robust=False)
         adjusted = state.adjust(None)

@@ -200,7 +200,7 @@ def connect_cameras(
             if not common:
                 continue
             a_T_b, support = vote_relative([by_camera[a][p] for p in common], [by_camera[b][p] for p in common])
-            if len(common) >= 5 and support.sum() < 0.4 * len(common):
+            if len(common) >= 5 and (support > 0.01).sum() < 0.5 * len(common):
                 _refuse_slipped(names[a], names[b], by_camera[a], by_camera[b], int((support > 0.1).sum()), len(common))
             edges.append((float(support.sum()), a, b, a_T_b))
             for p, s in zip(common, support, strict=True):

@@ -226,6 +226,13 @@ def assemble(
         np.array([bodies[int(p)] for p in poses]),
         np.where(body.known[:, None], body.points, 0.0),
     )
+    # without a file the prior is a lens without distortion, wherever the start values already are
+    centre = [
+        camera.vector if given.get(name) is not None
+        else Camera(camera.width, camera.height, (f := 0.5 * (camera.fx + camera.fy)), f,
+                    0.5 * (camera.width - 1), 0.5 * (camera.height - 1)).vector
+        for name, camera in zip(names, start, strict=True)
+    ]  # fmt: skip
     sigma = np.array([
         interior_prior(camera) * (1.0 if given.get(name) is None else _TRUST)
         for name, camera in zip(names, start, strict=True)
@@ -234,7 +241,7 @@ def assemble(
     tried, kept = interior_groups(names, given, settings)
     state = StationState(
         names, tuple(start), body, settings, mark_table, unknowns,
-        Prior(unknowns.interior.copy(), sigma, unknowns.points.copy(), weight), tried, kept, np.ones(len(names)),
+        Prior(np.array(centre), sigma, unknowns.points.copy(), weight), tried, kept, np.ones(len(names)),
         exterior_camera, first, tuple(fixed), poses,
     )  # fmt: skip
     for name, changes in settings.epochs.items():
