@@ -130,7 +130,8 @@ def _nodes_above_background(
         above = cv2.compare(image, threshold, cv2.CMP_GT)
         contours, hierarchy = cv2.findContours(above, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
         # texture and dust without end: look at what stands out more
-        if len(contours) <= _MAX_PARTS or lift > 0.3 * top:
+        extended = sum(len(contour) > 3 for contour in contours)  # single pixels are noise
+        if (extended <= _MAX_PARTS and len(contours) <= 20 * _MAX_PARTS) or lift > 0.3 * top:
             break
         lift *= 1.6
     return _first_nodes(above, background, offset, contours, hierarchy, settings, log)
