@@ -59,7 +59,7 @@ def workspace(model: RobotModel, count: int, rng: np.random.Generator) -> Array:
 
 
 def compiled_microseconds(model: RobotModel, targets: Array, near: Array) -> tuple[float, float, float]:
-    """Time a pose of forward model, first-order and exact command in C (gcc -O2), microseconds."""
+    """Time a pose of forward model, first-order and exact command in C (gcc -O2), microseconds, best of 20 rounds."""
     code = export_c(model, "robot")
     n, joints = near.shape
     numbers = ",\n".join(repr(float(v)) for v in targets[:, :3].ravel())
@@ -73,18 +73,19 @@ static const double near_q[{joints * n}] = {{{starts}}};
 static double seconds(void) {{ return (double)clock() / CLOCKS_PER_SEC; }}
 int main(void) {{
     robot_conditions c = {{robot_payload_load, {{0.0}}}};
-    double q[{joints}], T[12], sum = 0.0, start, t[3];
+    double q[{joints}], T[12], sum = 0.0, start, once, t[3] = {{1e9, 1e9, 1e9}};
     int i, round, kind;
     for (kind = 0; kind < 3; ++kind) {{
-        start = seconds();
         for (round = 0; round < 20; ++round) {{
+            start = seconds();
             for (i = 0; i < {n}; ++i) {{
                 if (kind == 0) {{ robot_forward(near_q + {joints} * i, &c, T); sum += T[3]; }}
                 if (kind == 1) {{ sum += robot_first_order(target + 12 * i, &c, near_q + {joints} * i, q, 0) + q[0]; }}
                 if (kind == 2) {{ sum += robot_exact(target + 12 * i, &c, near_q + {joints} * i, q, 0, 0) + q[0]; }}
             }}
+            once = (seconds() - start) / {n} * 1e6;
+            if (once < t[kind]) {{ t[kind] = once; }}
         }}
-        t[kind] = (seconds() - start) / 20.0 / {n} * 1e6;
     }}
     printf("%g %g %g %g\\n", t[0], t[1], t[2], sum);
     return 0;
@@ -137,7 +138,7 @@ def main() -> None:
             print(f"{name:22} {label:12} {regular.sum():6d} {row}   {worst:>10} ({hard.sum()})")
         if shutil.which("gcc"):
             timings.append((name, *compiled_microseconds(model, wanted[:500], q[:500])))
-    print("\ncompiled C (gcc -O2, one core), microseconds a pose")
+    print("\ncompiled C (gcc -O2, one core), microseconds a pose, best of 20 rounds")
     print(f"{'robot':22} {'forward':>10} {'one step':>10} {'iterated':>10}")
     for name, forward_us, first_us, exact_us in timings:
         print(f"{name:22} {forward_us:10.2f} {first_us:10.2f} {exact_us:10.2f}")

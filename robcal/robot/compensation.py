@@ -21,11 +21,21 @@ from numpy.typing import ArrayLike, NDArray
 
 from robcal.errors import InvalidInput
 from robcal.robot.chain import Chain, chain_of, forward, forward_and_jacobian
-from robcal.robot.inverse import Selection, check_frames, follow, inverse_kinematics, select
+from robcal.robot.inverse import (
+    EXPLAINED,
+    UNEXPLAINED,
+    Selection,
+    carried_arm,
+    check_frames,
+    explain_unreachable,
+    follow,
+    inverse_kinematics,
+    select,
+)
 from robcal.robot.inverse_numeric import BoolArray, NumericSettings, refine
 from robcal.robot.kernel import Kernel, PoseInputs
 from robcal.robot.model import GEOMETRIC_KINDS, RobotModel
-from robcal.transforms import Array, difference, frame_from_xyzrpy, invert
+from robcal.transforms import Array, difference, frame_from_xyzrpy, invert, retract
 
 Rows = NDArray[np.int_]
 LEFT_OVER = 1e-6
@@ -141,28 +151,39 @@ def compensate(
     target = given if frame == "world" else world_T_base @ given
     F = invert(world_T_base) @ target
     solutions = inverse_kinematics(chain, F, near, all_branches=False)
-    chosen = follow(solutions, solutions.near[0]) if options.as_path and len(F) else select(solutions)
+    path = options.as_path and len(F) > 0
+    chosen = follow(solutions, solutions.near[0], explain=False) if path else select(solutions, explain=False)
     every = kernel.poses(np.where(chosen.reachable[:, None], chosen.q, solutions.near), payload, covariates)
-    state = _State(chosen.q.copy(), F.copy(), list(chosen.reason), np.full((len(F), 6), np.nan))
+    state = _State(chosen.q.copy(), list(chosen.reason), np.full((len(F), 6), np.nan))
     rows = np.flatnonzero(chosen.reachable)
     state.remaining[rows] = _twist(kernel, every.subset(rows), target[rows])
     before = state.remaining.copy()
     steps = 0
     most = {"exact": options.iterations, "first_order": 1, "none": 0}[options.method]
     size = _size(chain, before)
+    quick = np.full(len(F), options.method == "exact" or chain.n_joints < 6)
     while steps < most and len(rows):
         steps += 1
-        moved = _correct(kernel, chain, state, every, F, rows, world_T_base)
-        rows = rows[moved]
+        # joint steps while they gain much; near singularities the closed form of the corrected target
+        stepped = _joint_step(chain, state, rows[quick[rows]])
+        rest = np.setdiff1d(rows, stepped, assume_unique=True)
+        quick[rest] = False
+        moved = _correct(kernel, chain, state, every, F, rest, world_T_base)
+        rows = np.concatenate([stepped, rest[moved]])
         state.remaining[rows] = _twist(kernel, every.subset(rows).with_q(state.q[rows]), target[rows])
         new = _size(chain, state.remaining[rows])
         # a loop that gains nothing ends
         going = (new > options.tolerance) & ((new < 0.9 * size[rows]) | (steps < 3))
+        quick[rows] &= (new < 0.25 * size[rows]) | (chain.n_joints < 6)
         size[rows] = np.minimum(size[rows], new)
         rows = rows[going]
     if options.method == "exact":
         _search_on(kernel, chain, state, every, target, solutions.near, options)
     reachable = np.all(np.isfinite(state.q), axis=1)
+    # the nearest pose costs a search, so reasons are found last and only for so many
+    unexplained = [i for i in np.flatnonzero(~reachable) if state.reason[i] is None]
+    for k, i in enumerate(unexplained):
+        state.reason[i] = explain_unreachable(solutions, int(i)) if k < EXPLAINED else UNEXPLAINED
     F_star = np.full_like(F, np.nan)
     if np.any(reachable):
         # the command's own target: where the nominal robot's tool is with these joint values
@@ -179,7 +200,6 @@ def compensate(
 @dataclass
 class _State:
     q: Array
-    F_star: Array
     reason: list[str | None]
     remaining: Array
 
@@ -193,41 +213,57 @@ def _twist(kernel: Kernel, poses: PoseInputs, target: Array) -> Array:
     return difference(target, kernel.frames(kernel.theta0, poses))
 
 
+def _joint_step(chain: Chain, state: _State, rows: Rows) -> Rows:
+    """Joint step of the nominal robot that takes the real tool to the target; returns the rows that it moved.
+
+    For fewer than six joints position goes before orientation: the target's unreachable part must not pile up in F*.
+    A track under an arm stays where it is.
+    """
+    if not len(rows):
+        return rows
+    q = state.q[rows]
+    _, J = forward_and_jacobian(chain, q)
+    held = carried_arm(chain)[1]
+    weight = NumericSettings().weight(chain)
+    Jw = weight[:, None] * J[:, :, held:]
+    normal = np.swapaxes(Jw, 1, 2) @ Jw + 1e-14 * np.eye(Jw.shape[2])
+    # remaining is where the real tool is, seen from the target; the way back is seen from the real tool
+    back = difference(retract(np.eye(4), state.remaining[rows]), np.eye(4))
+    gradient = np.einsum("nij,ni->nj", Jw, weight * back)
+    step = np.zeros_like(q)
+    step[:, held:] = np.linalg.solve(normal, gradient[..., None])[..., 0]
+    largest = np.max(np.abs(step), axis=1, keepdims=True)
+    new = q + step * np.minimum(1.0, LARGEST_STEP / np.maximum(largest, 1e-300))
+    good = np.all((new >= chain.lower - 1e-9) & (new <= chain.upper + 1e-9), axis=1)
+    state.q[rows[good]] = new[good]
+    return rows[good]
+
+
 def _correct(
     kernel: Kernel, chain: Chain, state: _State, every: PoseInputs, F: Array, rows: Rows, world_T_base: Array
 ) -> BoolArray:
-    """One correction of the given rows in place; False where the corrected target is out of reach."""
+    """``F* <- F* Fh^-1 F`` with ``F* = K(q)`` and its joint values, in place; False where that is out of reach."""
     if not len(rows):
         return np.zeros(0, bool)
     q = state.q[rows]
-    Fh = invert(world_T_base) @ kernel.frames(kernel.theta0, every.subset(rows).with_q(q))
     if chain.n_joints < 6:
-        # The target's unreachable part must not pile up in F*, so the correction is made in joint space: the nominal
-        # robot's step that takes the real tool to the target, position before orientation.
-        _, J = forward_and_jacobian(chain, q)
-        weight = NumericSettings().weight(chain)[:, None]
-        twist = difference(Fh, F[rows])[..., None]
-        normal = np.swapaxes(weight * J, 1, 2) @ (weight * J) + 1e-14 * np.eye(chain.n_joints)
-        step = np.linalg.solve(normal, np.swapaxes(weight * J, 1, 2) @ (weight * twist))[..., 0]
-        largest = np.max(np.abs(step), axis=1, keepdims=True)
-        new = q + step * np.minimum(1.0, LARGEST_STEP / np.maximum(largest, 1e-300))
-        moved = np.all((new >= chain.lower - 1e-9) & (new <= chain.upper + 1e-9), axis=1)
-        reasons: list[str | None] = ["the correction leads beyond a joint limit or out of the workspace"] * len(rows)
-        new = np.where(moved[:, None], new, np.nan)
-    else:
-        state.F_star[rows] = state.F_star[rows] @ invert(Fh) @ F[rows]
-        chosen = select(inverse_kinematics(chain, state.F_star[rows], q, all_branches=False))
-        new, moved = chosen.q, chosen.reachable
-        reasons = [None if r is None else f"the frame is, but its corrected target is not: {r}" for r in chosen.reason]
-        with np.errstate(invalid="ignore"):
-            flipped = moved & (np.max(np.abs(new - q), axis=1) > FLIP)
-        moved = moved & ~flipped
-        new = np.where(moved[:, None], new, np.nan)
-        for i in np.flatnonzero(flipped):
-            reasons[i] = "the corrected target is not reachable in this configuration (singular or fully stretched)"
-    state.q[rows] = new
-    for i in np.flatnonzero(~moved):
-        state.reason[rows[i]] = reasons[i]
+        for i in rows:
+            state.reason[i] = "the correction leads beyond a joint limit or out of the workspace"
+        state.q[rows] = np.nan
+        return np.zeros(len(rows), bool)
+    Fh = invert(world_T_base) @ kernel.frames(kernel.theta0, every.subset(rows).with_q(q))
+    F_star = forward(chain, q) @ invert(Fh) @ F[rows]
+    chosen = select(inverse_kinematics(chain, F_star, q, all_branches=False), explain=False)
+    with np.errstate(invalid="ignore"):
+        flipped = chosen.reachable & (np.max(np.abs(chosen.q - q), axis=1) > FLIP)
+    moved = chosen.reachable & ~flipped
+    state.q[rows] = np.where(moved[:, None], chosen.q, np.nan)
+    for k in np.flatnonzero(~moved):
+        state.reason[rows[k]] = (
+            "the corrected target is not reachable in this configuration (singular or fully stretched)"
+            if flipped[k]
+            else "the nominal robot reaches the frame, but not its corrected target (limits or workspace)"
+        )
     return moved
 
 

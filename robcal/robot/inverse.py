@@ -26,6 +26,8 @@ SINGULAR_CONDITION = 1e-4
 EXPLAINED = 25
 """So many unreachable frames of one request are explained one by one."""
 
+UNEXPLAINED = "out of reach or beyond a joint limit"
+
 _LIMIT_SLACK = 1e-9
 
 
@@ -132,11 +134,11 @@ def select(solutions: InverseSolutions, near: ArrayLike | None = None, *, explai
     if explain:
         for k, i in enumerate(np.flatnonzero(~reachable)):
             # the nearest pose costs a search: enough of them is enough
-            reasons[i] = explain_unreachable(solutions, int(i)) if k < EXPLAINED else "out of reach or beyond a limit"
+            reasons[i] = explain_unreachable(solutions, int(i)) if k < EXPLAINED else UNEXPLAINED
     return Selection(chosen, reachable, tuple(reasons))
 
 
-def follow(solutions: InverseSolutions, start: ArrayLike) -> Selection:
+def follow(solutions: InverseSolutions, start: ArrayLike, *, explain: bool = True) -> Selection:
     """Like :func:`select`, each frame near the configuration chosen for the frame before it (a path)."""
     chain = solutions.chain
     current = check_joint_angles(chain, start)[0]
@@ -147,7 +149,7 @@ def follow(solutions: InverseSolutions, start: ArrayLike) -> Selection:
             q=solutions.q[i : i + 1], within_limits=solutions.within_limits[i : i + 1],
             excess=solutions.excess[i : i + 1],
         )  # fmt: skip
-        step = select(one)
+        step = select(one, explain=explain)
         chosen.append(step.q[0])
         reachable.append(bool(step.reachable[0]))
         reasons.append(step.reason[0])
@@ -236,15 +238,21 @@ def _polish(chain: Chain, frames: Array, q: Array) -> Array:
     out = q.copy()
     rows, cols = np.nonzero(np.all(np.isfinite(q), axis=-1))
     values, wanted = q[rows, cols], frames[rows]
+    error = np.zeros(len(values))
+    poor = np.arange(len(values))
     for _ in range(6):
-        T, J = forward_and_jacobian(chain, values) if len(values) else (wanted, np.empty((0, 6, chain.n_joints)))
-        r = difference(T, wanted)
-        poor = np.flatnonzero(np.max(np.abs(r), axis=1, initial=0.0) > 1e-11)
         if not len(poor):
             break
-        # small singular values are cut: in a singular pose the closed form's own choice of the free joint is kept
-        values[poor] += np.einsum("nij,nj->ni", np.linalg.pinv(J[poor], rcond=1e-6), r[poor])
-    error = np.max(np.abs(difference(forward(chain, values), wanted)), axis=1) if len(values) else np.empty(0)
+        r = difference(forward(chain, values[poor]), wanted[poor])
+        error[poor] = np.max(np.abs(r), axis=1)
+        bad = error[poor] > 1e-11
+        poor, r = poor[bad], r[bad]
+        if len(poor):
+            # small singular values are cut: in a singular pose the closed form's own choice of the free joint is kept
+            _, J = forward_and_jacobian(chain, values[poor])
+            values[poor] += np.einsum("nij,nj->ni", np.linalg.pinv(J, rcond=1e-6), r)
+    if len(poor):
+        error[poor] = np.max(np.abs(difference(forward(chain, values[poor]), wanted[poor])), axis=1)
     values[error > 1e-8] = np.nan
     out[rows, cols] = values
     # branches that have become one
