@@ -130,7 +130,7 @@ def gauss_newton(
             length *= 0.5
             halvings += 1
         else:
-            near = promise <= 1e-6 * (1.0 + cost)
+            near = promise <= 1e-3 + 1e-6 * cost  # a few hundredths of a standard deviation
             return state, summary(near, "no fraction of the step lowers the cost")
         gained, state, cost = cost - new_cost, candidate, new_cost
         history.append(cost)
@@ -207,6 +207,9 @@ def split_dependent(
         row = work[k, k + 1 :] / pivot
         work[k + 1 :, k + 1 :] -= np.outer(work[k + 1 :, k], row)
     eliminated = []
+    if limits is not None:
+        kept, weak = _drop_weak_directions(N, kept, np.asarray(limits))
+        dropped += weak
     if dropped and not ties:
         return kept, [Eliminated(names[k], reason, {}, sigma) for k, reason, sigma in dropped]
     if dropped:
@@ -221,6 +224,33 @@ def split_dependent(
             }
             eliminated.append(Eliminated(names[k], reason, tied, sigma))
     return kept, eliminated
+
+
+def _drop_weak_directions(N: Array, kept: list[int], limits: Array) -> tuple[list[int], list[tuple[int, str, float]]]:
+    """Drop parameters until none has a sigma, with all others free, above what is plausible.
+
+    Each may be well determined given those before it, and yet a mixture of many be open: then the last of them in the
+    order of preference goes, whose fixing costs nothing since its own sigma is above its plausible size.
+    """
+    dropped: list[tuple[int, str, float]] = []
+    kept = list(kept)
+    while True:
+        bounded = [k for k in kept if np.isfinite(limits[k])]
+        free = [k for k in kept if not np.isfinite(limits[k])]
+        if not bounded:
+            return kept, dropped
+        M = N[np.ix_(bounded, bounded)]
+        if free:
+            across = N[np.ix_(free, bounded)]
+            M = M - across.T @ linalg.lstsq(N[np.ix_(free, free)], across, cond=1e-14)[0]
+        scaled = M * np.outer(limits[bounded], limits[bounded])
+        values, vectors = linalg.eigh(scaled, check_finite=False)
+        sigma = np.sqrt(np.sum(vectors**2 / np.maximum(values, 1e-14 * values[-1]), axis=1))
+        if sigma.max() < 1.0:
+            return kept, dropped
+        last = int(np.flatnonzero(sigma >= max(1.0, 0.3 * sigma.max()))[-1])
+        dropped.append((bounded[last], "weak", float(sigma[last] * limits[bounded[last]])))
+        kept.remove(bounded[last])
 
 
 @dataclass(frozen=True)

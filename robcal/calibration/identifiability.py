@@ -27,6 +27,9 @@ PLAUSIBLE_LENGTH = 2e-3
 PLAUSIBLE_ANGLE = 2e-3
 """The same for angles (rad), and for what an elasticity turns its angle at the largest moment met."""
 
+PLAUSIBLE_START = 0.1
+"""Base and tool are not known beforehand, but what the data leave open by more than this (m, rad) stays as constructed."""
+
 SAME_POSE = 1e-4
 """Joint angles (rad) within which poses count as repetitions of one another."""
 
@@ -99,7 +102,7 @@ def choose_candidates(model: RobotModel, parameters: str | Sequence[str]) -> Can
 
 
 def plausible_limits(model: RobotModel, moments: Array, names: Sequence[str]) -> Array:
-    """Standard deviation (p,) above which a parameter is not worth identifying; infinite for base, tool, terms, loads.
+    """Standard deviation (p,) above which a parameter is not worth identifying; infinite for terms and loads.
 
     ``moments`` are the poses' moments (n, m) in the order of :func:`robcal.robot.statics.moment_names`.
     """
@@ -108,6 +111,8 @@ def plausible_limits(model: RobotModel, moments: Array, names: Sequence[str]) ->
     frames = {f.name for f in model.frames}
     for k, name in enumerate(names):
         frame, _, kind = name.rpartition(".")
+        if frame in ("base", "tool"):
+            limits[k] = PLAUSIBLE_START
         if frame not in frames:
             continue
         if kind in ("x", "y", "z"):

@@ -43,6 +43,8 @@ from robcal.robot.model import RobotModel
 
 Array = NDArray[np.float64]
 
+LATE_SHARE = 0.2
+"""Share of the plausible sigma below which a parameter may enter that was dependent at the start values."""
 OUTLIER_LEVEL = 1e-3
 """Probability that the largest of all poses is called an outlier by chance."""
 OUTLIER_SHARE = 0.15
@@ -283,6 +285,8 @@ class _Engine:
         names = (*self.choice.forced, *self.choice.own_axis) if names is None else tuple(names)
         iterations = 0
         first: SolveSummary | None = None
+        best: tuple[float, _Solution] | None = None
+        rows = int(weights.astype(bool) @ self.stack.used.sum(axis=1))
         kept, eliminated = self._eliminate(state, names, weights)
         for round_ in range(4):
             problem = self.problem(state, kept, weights)
@@ -291,21 +295,28 @@ class _Engine:
             )
             iterations += summary.iterations
             first = summary if first is None else first
-            # After a fit the data's own scatter tells how far the stated covariance can be trusted.
-            rows = int(weights.astype(bool) @ self.stack.used.sum(axis=1))
-            self.scatter = max(1.0, float(np.sqrt(2.0 * summary.cost / max(1, rows - len(kept)))))
-            # Deviations make some parameters visible that are dependent at nominal (parallel axes), and hide others.
-            # Only the first look adds any; later ones only take away, so nothing can go round in circles.
+            self.scatter = self._scatter(state, names, weights)
+            # What looks weak where it is linearised may matter further on: no look may make the fit worse than the
+            # parameters that it saves are worth (Bayesian information criterion).
+            worth = 2.0 * summary.cost / self.scatter**2 + len(kept) * np.log(max(2, rows))
+            if best is not None and worth > best[0]:
+                break
+            best = (worth, _Solution(problem, state, tuple(kept), eliminated, {}, first, summary, iterations))
             if round_ == 3:
                 break
+            # Deviations make some parameters visible that are dependent at nominal (parallel axes), and hide others.
+            # Only the first look adds any; later ones only take away, so nothing can go round in circles.
             again, eliminated = self._eliminate(state, names if round_ == 0 else kept, weights, eliminated)
-            lost = [n for n in kept if n not in again and not n.startswith(("base.", "tool."))]
             if again == kept:
+                best = (worth, replace(best[1], eliminated=eliminated))
                 break
+            lost = [n for n in kept if n not in again and not n.startswith(("base.", "tool."))]
             if lost:
                 state = self._reset(state, lost)
             kept = again
-        return _Solution(problem, state, tuple(kept), eliminated, {}, first or summary, summary, iterations)
+        if best is None:
+            raise NotIdentifiable("the iteration ended before its first step", kept)
+        return replace(best[1], iterations=iterations)
 
     def choose(self, solution: _Solution, weights: Array) -> _Solution:
         """Choose among the elasticities at a solution and iterate with those that stay."""
@@ -328,10 +339,12 @@ class _Engine:
             names[k]: float(p) for k, p in zip(optional, picked.p_values, strict=True) if names[k] not in taken
         }
         state = self._reset(solution.state, [n for n in (*own, *cross) if n not in taken])
+        gone = {n: e for n, e in solution.eliminated.items() if n not in taken}
         if set(taken) == set(solution.names) - set(forced):
             final = solution
         else:
-            final = self.solve(state, weights, (*self.choice.forced, *taken))
+            final = self.solve(state, weights, (*forced, *taken))
+            final = replace(final, eliminated={**gone, **final.eliminated})
         iterations = solution.iterations + (final.iterations if final is not solution else 0)
         return replace(final, rejected=rejected, first=solution.first, iterations=iterations)
 
@@ -342,6 +355,23 @@ class _Engine:
         theta[elastic] = 0.0
         return State(theta, state.world_T_base, state.flange_T_tool)
 
+    def _scatter(self, state: State, names: Sequence[str], weights: Array) -> float:
+        """How far the stated covariance can be trusted: sigma0 of the data with all candidates free, one at least.
+
+        With all candidates, also the dependent ones (pseudo-inverse), or a parameter left out too early would make the
+        data look so bad that it could not come back.
+        """
+        r, J = self.problem(state, names, weights).linearise(state)
+        scale = np.linalg.norm(J, axis=0)
+        scale[scale == 0] = 1.0
+        scaled = J / scale
+        values, vectors = np.linalg.eigh(scaled.T @ scaled)
+        good = values > 1e-10 * values[-1]
+        along = vectors[:, good].T @ (scaled.T @ r)
+        left = float(r @ r - np.sum(along**2 / values[good]))
+        rows = int(weights.astype(bool) @ self.stack.used.sum(axis=1))
+        return max(1.0, float(np.sqrt(max(0.0, left) / max(1, rows - int(good.sum())))))
+
     def _limits(self, state: State, names: Sequence[str]) -> Array:
         return plausible_limits(self.kernel.model, self.evaluator(state).moments, names) / self.scatter
 
@@ -350,7 +380,11 @@ class _Engine:
     ) -> tuple[list[str], dict[str, Eliminated]]:
         """Names that stay, in order, and all that were eliminated, those of ``before`` included."""
         _, J = self.problem(state, names, weights).linearise(state)
-        kept, gone = split_dependent(J.T @ J, names, self._limits(state, names), ties=before is not None)
+        limits = self._limits(state, names)
+        if before is not None:
+            # what enters late lies in a curved valley: only if the data say much more about it than was known
+            limits = np.where([n in before for n in names], LATE_SHARE * limits, limits)
+        kept, gone = split_dependent(J.T @ J, names, limits, ties=before is not None)
         if not kept:
             raise NotIdentifiable("the measurements do not depend on any parameter of the robot", names)
         stay = [names[k] for k in kept]
