@@ -189,8 +189,7 @@ def adjust(
     shape_datum: DatumWish = datum if isinstance(datum, (tuple, InnerOver)) else "free"
     while True:
         basis = intrinsics_basis(free)
-        _clean(work, basis, free, target_ids, shape_datum, settings)
-        bad = _undetermined(work, basis, free, target_ids, shape_datum)
+        bad = _clean(work, basis, free, target_ids, shape_datum, settings)
         if not bad:
             break
         _leave_out(bad, free, left_out, work, camera, settings)
@@ -262,8 +261,11 @@ def _clean(
     ids: IntArray,
     datum: DatumWish,
     settings: AdjustSettings,
-) -> None:
-    """Adjust without scale bars, first robustly, and take out gross errors until none is left."""
+) -> tuple[str, ...]:
+    """Adjust without scale bars, first robustly, and take out gross errors until none is left.
+
+    Returns the free intrinsics that the marks left over do not determine, worst first.
+    """
     robust = settings.huber if settings.robust else None
     none = Lengths.none()
     while True:
@@ -315,7 +317,7 @@ def _clean(
         # several components shift weights among each other; one alone only scales
         if len(grown) > 1 and np.max(np.abs(grown / grown[0] - 1.0)) > 0.01:
             continue
-        return
+        return _undetermined(problem, state, free, Q * float(np.max(grown)) ** 2)
 
 
 def _take_out(work: _Work, problem: Problem, r: Array, statistic: Array, critical: float, reason: str) -> bool:
@@ -368,15 +370,10 @@ def _raise_singular(problem: Problem, state: State, free: Sequence[str], ids: In
     )
 
 
-def _undetermined(work: _Work, basis: Array, free: Sequence[str], ids: IntArray, datum: DatumWish) -> tuple[str, ...]:
+def _undetermined(problem: Problem, state: State, free: Sequence[str], Q: Array) -> tuple[str, ...]:
     """Free intrinsics that the marks do not determine, worst first."""
     if not free:
         return ()
-    problem, state, _, targets, _ = work.build(basis, ids, datum, Lengths.none())
-    try:
-        _, Q = _cofactors(problem, state)
-    except np.linalg.LinAlgError:
-        _raise_singular(problem, state, free, ids[targets])
     sigma = np.sqrt(np.maximum(np.diag(Q)[: len(free)], 0.0))
     marks, c = problem.order.marks, state.camera
     ideal = (marks.xy - [c.cx, c.cy]) / [c.fx, c.fy]

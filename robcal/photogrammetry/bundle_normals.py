@@ -17,7 +17,7 @@ from scipy import linalg
 
 from robcal.photogrammetry.camera import Camera, project_with_jacobians
 from robcal.photogrammetry.network import ImageMarks, IntArray
-from robcal.transforms import Array, retract, skew
+from robcal.transforms import Array, retract
 
 
 @dataclass(frozen=True)
@@ -97,13 +97,19 @@ def linearise(state: State, order: MarkOrder, basis: Array, shift: Array) -> Lin
     X = state.points[marks.target]
     p = np.einsum("mij,mj->mi", R, X) + state.camera_T_body[marks.image, :3, 3]
     xy, d_point, d_in = project_with_jacobians(state.camera, p)
-    whitener = order.whitener
     J = np.empty((len(marks), 2, k + 9))
-    J[:, :, :k] = whitener @ (d_in @ basis)
-    J[:, :, k : k + 3] = (whitener @ d_point) @ R
+    J[:, :, :k] = (d_in.reshape(-1, 9) @ basis).reshape(-1, 2, k)
+    J[:, :, k : k + 3] = d_point @ R
+    # whitened by the lower triangle L^-1; element by element, as products of small matrices are slow in numpy
+    w, by_camera_and_point = order.whitener, J[:, :, : k + 3]
+    by_camera_and_point[:, 1] *= w[:, 1, 1, None]
+    by_camera_and_point[:, 1] += w[:, 1, 0, None] * by_camera_and_point[:, 0]
+    by_camera_and_point[:, 0] *= w[:, 0, 0, None]
     J[:, :, k + 3 : k + 6] = J[:, :, k : k + 3]
-    J[:, :, k + 6 :] = -J[:, :, k : k + 3] @ skew(X)
-    r = np.einsum("mij,mj->mi", whitener, marks.xy - shift - xy)
+    # -j [X] = X x j
+    for a, b, c in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        J[:, :, k + 6 + a] = X[:, None, b] * J[:, :, k + c] - X[:, None, c] * J[:, :, k + b]
+    r = np.einsum("mij,mj->mi", order.whitener, marks.xy - shift - xy)
     return Linearised(r, J, k)
 
 
@@ -151,20 +157,19 @@ def build_normals(lin: Linearised, weights: Array | None, order: MarkOrder, leng
     V = np.zeros((n, 6, 6))
     b = np.zeros(a)
     s = np.zeros((n, 6))
-    camera_and_station = np.concatenate([J[:, :, :k], J[:, :, k + 3 :]], axis=2)
     for j, rows in enumerate(order.image_slices):
-        block = camera_and_station[rows].reshape(-1, k + 6)
+        block = J[rows].reshape(-1, k + 9)
         product = block.T @ block
         A[:k, :k] += product[:k, :k]
-        G[j, :k] = product[:k, k:]
-        V[j] = product[k:, k:]
+        G[j, :k] = product[:k, k + 3 :]
+        V[j] = product[k + 3 :, k + 3 :]
         right = block.T @ r[rows].reshape(-1)
         b[:k] += right[:k]
-        s[j] = right[k:]
-    point = np.ascontiguousarray(J[order.by_target][:, :, : k + 3])
+        s[j] = right[k + 3 :]
+    by_target = J[order.by_target]
     r_by_target = r[order.by_target]
     for i, rows in enumerate(order.target_slices):
-        block = point[rows].reshape(-1, k + 3)
+        block = by_target[rows].reshape(-1, k + 9)[:, : k + 3]
         product = block[:, k:].T @ block
         at = slice(k + 3 * i, k + 3 * i + 3)
         A[at, :k] = product[:, :k]

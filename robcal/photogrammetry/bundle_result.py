@@ -84,10 +84,10 @@ def finish(
     C = rel.residual_cofactor
     residuals = np.einsum("mij,mj->mi", L, lin.r)
     in_pixels = L @ C @ np.swapaxes(L, 1, 2)
-    redundancy = np.diagonal(L @ C @ np.linalg.inv(L), axis1=1, axis2=2)
+    shares = np.diagonal(L @ C @ np.linalg.inv(L), axis1=1, axis2=2)
     spread = np.sqrt(np.maximum(np.diagonal(in_pixels, axis1=1, axis2=2), 0.0))
     spread = spread * group_sigma0[problem.group][:, None]
-    w = np.where(redundancy > 1e-4, residuals / np.maximum(spread, 1e-300), 0.0)
+    w = np.where(shares > 1e-4, residuals / np.maximum(spread, 1e-300), 0.0)
     total = round(float(np.sum(rel.share)))
     if len(stated_sigma):
         total = 2 * len(problem.order.marks) + len(stated_sigma) - k - 6 * problem.order.images
@@ -111,7 +111,7 @@ def finish(
         points_intrinsics_covariance=frozen(Q[k:, :k] @ problem.basis.T),
         marks=problem.order.marks,
         residuals=frozen(residuals),
-        redundancy=frozen(redundancy),
+        redundancy=frozen(shares),
         w=frozen(w),
         statistic=frozen(test_statistics(whitened, rel)),
         normals=frozen(problem.target_normals(state.points)),

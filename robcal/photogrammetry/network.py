@@ -68,8 +68,8 @@ class ImageMarks:
         if not np.all(np.isfinite(self.xy)):
             row = int(np.argmax(~np.all(np.isfinite(self.xy), axis=1)))
             raise InvalidInput(f"mark in row {row} has a coordinate that is no number: remove it or measure it again")
-        variances = self.covariance[:, [0, 1], [0, 1]]
-        if m and not np.all(np.linalg.det(self.covariance) * (variances.min(axis=1) > 0) > 0):
+        a, b, c = self.covariance[:, 0, 0], self.covariance[:, 0, 1], self.covariance[:, 1, 1]
+        if not np.all((a > 0) & (c > 0) & (a * c > b * b)):
             raise InvalidInput("a mark has a covariance that is not positive definite: its sigma must be above zero")
 
     def __len__(self) -> int:
