@@ -1,0 +1,22 @@
+"""Whitening of errors that the rows of a pose share."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from robcal.diagnosis.decorrelation import SharedNoise
+
+
+def test_shared_errors_become_white_and_come_back() -> None:
+    rng = np.random.default_rng(0)
+    pose = np.array([0, 1, 0, 1, 2])
+    moved = rng.normal(size=(5, 3, 2))
+    shared = SharedNoise(pose, moved, 2.5)
+    A = np.zeros((15, 6))
+    for i, p in enumerate(pose):
+        A[3 * i : 3 * i + 3, 2 * p : 2 * p + 2] = moved[i]
+    covariance = np.eye(15) + 2.5 * A @ A.T
+    W = shared.whiten(np.eye(15))
+    assert np.allclose(W @ covariance @ W.T, np.eye(15), atol=1e-10)
+    x = rng.normal(size=(15, 4))
+    assert np.allclose(shared.unwhiten(shared.whiten(x)), x)

@@ -1,0 +1,78 @@
+"""Whole diagnoses of concealed campaigns; the effects are drawn by the fixtures, whose physics are their own."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from robcal.diagnosis.contract import as_contract
+from robcal.diagnosis.diagnose import diagnose
+from robcal.diagnosis.result import Diagnosis
+from tests.diagnosis.recordings import concealed
+
+
+def run(folder: Path, seed: int, *effects: str, **plan: object) -> tuple[Diagnosis, object]:
+    found, identify, verify, truth = concealed(folder, seed=seed, effects=list(effects), **plan)
+    return diagnose(found.model, identify, found.names, tuple(found.eliminated), verify), truth
+
+
+def test_nothing_missing(tmp_path: Path) -> None:
+    diagnosis, _ = run(tmp_path, 100)
+    assert not diagnosis.mismatch
+    assert diagnosis.p_value > 0.01
+    assert "Nothing is missing" in str(as_contract(diagnosis)["statement"])
+
+
+@pytest.mark.parametrize(("seed", "cause"), [(102, "zero_jump"), (104, "gear_ripple"), (114, "scale_error")])
+def test_single_cause_is_named_where_it_is(tmp_path: Path, seed: int, cause: str) -> None:
+    diagnosis, truth = run(tmp_path, seed, cause)
+    effect = truth.plan.effects[0]
+    assert [f.family.cause for f in diagnosis.findings] == [cause]
+    assert diagnosis.findings[0].family.where == effect.where
+    before, after, floor = diagnosis.heldout
+    assert after < before
+    assert after < 1.15 * floor
+    assert diagnosis.unexplained_p > 0.01
+
+
+def test_amplitude_within_its_sigma(tmp_path: Path) -> None:
+    diagnosis, truth = run(tmp_path, 114, "scale_error")
+    told, sigma = diagnosis.findings[0].parameters["ppm"], diagnosis.findings[0].sigma["ppm"]
+    assert abs(told - truth.plan.effects[0].parameters["ppm"]) < 4 * sigma
+
+
+def test_exchanged_targets_are_read_right(tmp_path: Path) -> None:
+    diagnosis, truth = run(tmp_path, 114, "target_swapped")
+    effect = truth.plan.effects[0]
+    told = diagnosis.findings[0]
+    assert told.family.cause == "target_swapped"
+    assert {int(told.family.where), told.parameters["with"]} == {int(effect.where), int(effect.parameters["with"])}
+    assert diagnosis.heldout[1] < 0.01 * diagnosis.heldout[0]
+
+
+def test_outside_the_library_is_unknown_and_still_modelled(tmp_path: Path) -> None:
+    diagnosis, truth = run(tmp_path, 116, "damaged_tooth", snr=14.0)
+    found = diagnosis.findings[0]
+    assert found.family.cause == "unknown"
+    assert found.family.where == truth.plan.effects[0].where
+    assert diagnosis.heldout[1] < diagnosis.heldout[0]
+    assert found.parameters["term"]["formula"]
+
+
+def test_contract_is_plain_json(tmp_path: Path) -> None:
+    diagnosis, _ = run(tmp_path, 102, "zero_jump")
+    content = json.loads(json.dumps(as_contract(diagnosis), allow_nan=False))
+    assert content["format"] == "robcal/diagnosis-1"
+    assert content["causes"][0]["parameters"]["pose"].startswith("p")
+    assert {"before", "after", "noise_floor"} <= set(content["heldout_mm"])
+
+
+def test_extended_model_predicts_better_where_nobody_measured(tmp_path: Path) -> None:
+    found, identify, verify, truth = concealed(tmp_path, seed=104, effects=["gear_ripple"], snr=20.0)
+    diagnosis = diagnose(found.model, identify, found.names, tuple(found.eliminated), verify)
+    assert len(diagnosis.model.terms) == 1
+    assert diagnosis.heldout[0] > diagnosis.heldout[1]
+    assert np.isfinite([v for t in diagnosis.model.terms for v in t.parameters.values()]).all()
