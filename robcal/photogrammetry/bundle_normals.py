@@ -98,7 +98,7 @@ def linearise(state: State, order: MarkOrder, basis: Array, shift: Array) -> Lin
     p = np.einsum("mij,mj->mi", R, X) + state.camera_T_body[marks.image, :3, 3]
     xy, d_point, d_in = project_with_jacobians(state.camera, p)
     J = np.empty((len(marks), 2, k + 9))
-    J[:, :, :k] = (d_in.reshape(-1, 9) @ basis).reshape(-1, 2, k)
+    J[:, :, :k] = (d_in.reshape(-1, 9) @ basis).reshape(len(marks), 2, k)
     J[:, :, k : k + 3] = d_point @ R
     # whitened by the lower triangle L^-1; element by element, as products of small matrices are slow in numpy
     w, by_camera_and_point = order.whitener, J[:, :, : k + 3]
