@@ -44,7 +44,7 @@ def families(where: RobotSite) -> list:  # type: ignore[type-arg]
 
 
 def test_every_cause_of_the_robot_is_there() -> None:
-    assert {family.cause for family in families(site())} == ROBOT_CAUSES
+    assert {family.cause for family in families(site(frozenset({"axis1.elastic_yaw"})))} == ROBOT_CAUSES
 
 
 def test_weights_are_shared_among_places() -> None:
