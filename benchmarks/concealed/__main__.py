@@ -27,14 +27,20 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):  # before numpy is loa
 from benchmarks.concealed.adapter import ADAPTERS, Answer  # noqa: E402
 from benchmarks.concealed.scenarios import BATTERIES, Scenario  # noqa: E402
 from benchmarks.concealed.scoring import score  # noqa: E402
+from benchmarks.concealed.sighting_runs import Sighting, run_sighting, sightings  # noqa: E402
 from benchmarks.concealed.tables import report  # noqa: E402
 from fixtures.campaigns import write_campaign, write_poses  # noqa: E402
 from fixtures.plan import Truth  # noqa: E402
 from fixtures.recordings import driven_further, record  # noqa: E402
 
+LEVELS = ("points", "frames", "distances", "sensor", "survey", "station")
+"""Levels of measurement; surveys and stations have the batteries nulls and singles only."""
 
-def run_one(scenario: Scenario, adapter: str) -> dict[str, Any]:
+
+def run_one(scenario: Scenario | Sighting, adapter: str) -> dict[str, Any]:
     """Make, run and score one campaign; a failure of the tool is a record with ``error``."""
+    if isinstance(scenario, Sighting):
+        return run_sighting(scenario)
     head = {"key": scenario.key, "battery": scenario.battery, "label": scenario.label, "level": scenario.level}
     head |= {"snr": scenario.snr, "seed": scenario.seed}
     plan = scenario.build()
@@ -78,8 +84,13 @@ def _read(path: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
 
 
-def _wanted(arguments: argparse.Namespace, done: set[str]) -> Iterator[Scenario]:
-    for scenario in BATTERIES[arguments.battery](arguments.count, arguments.seed, arguments.level):
+def _wanted(arguments: argparse.Namespace, done: set[str]) -> Iterator[Scenario | Sighting]:
+    scenarios: Iterator[Scenario | Sighting]
+    if arguments.level in ("survey", "station"):
+        scenarios = sightings(arguments.battery, arguments.count, arguments.seed, arguments.level)
+    else:
+        scenarios = BATTERIES[arguments.battery](arguments.count, arguments.seed, arguments.level)
+    for scenario in scenarios:
         chosen = not arguments.causes or scenario.label in arguments.causes
         snr = not arguments.snr or scenario.snr in arguments.snr
         if chosen and snr and scenario.key not in done:
@@ -133,7 +144,7 @@ def main() -> int:
     parser.add_argument("records", nargs="*", type=Path, help="with 'table': stored records")
     parser.add_argument("--count", type=int, default=1, help="repetitions of the battery")
     parser.add_argument("--seed", type=int, default=10_000)
-    parser.add_argument("--level", default="points", choices=["points", "frames", "distances", "sensor"])
+    parser.add_argument("--level", default="points", choices=LEVELS)
     parser.add_argument("--causes", nargs="*", default=[], help="only scenarios with these labels")
     parser.add_argument("--snr", nargs="*", type=float, default=[], help="only these classes of SNR")
     parser.add_argument("--adapter", choices=sorted(ADAPTERS), default="library")
@@ -141,6 +152,8 @@ def main() -> int:
     parser.add_argument("--out", type=Path, help="file of records (JSON lines), appended to and resumed from")
     parser.add_argument("-q", "--quiet", action="store_true")
     arguments = parser.parse_args()
+    if arguments.level in ("survey", "station") and arguments.battery not in ("nulls", "singles", "table"):
+        parser.error(f"the level {arguments.level} has the batteries nulls and singles only")
     if arguments.battery == "table":
         records = [r for path in arguments.records for r in _read(path)]
     else:
