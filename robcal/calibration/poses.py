@@ -30,7 +30,7 @@ from robcal.calibration.visibility import frame_information
 from robcal.errors import InvalidInput
 from robcal.robot.chain import chain_of
 from robcal.robot.kernel import Kernel, PoseInputs
-from robcal.robot.model import RobotModel
+from robcal.robot.model import RobotModel, parameter_names
 from robcal.robot.statics import moment_names
 from robcal.transforms import Array
 
@@ -115,6 +115,7 @@ def generate_poses(request: PoseRequest) -> PosePlan:
     InvalidInput : numbers out of range, an unknown payload or parameter, or a cell in which nothing can be measured.
     """
     _check(request)
+    _names(request)
     rng = np.random.default_rng(request.seed)
     model = request.model
     chain = chain_of(model)
@@ -154,7 +155,7 @@ def design_of(request: PoseRequest, candidates: Candidates) -> Design:
     )  # fmt: skip
     kernel = Kernel(nominal)
     poses = kernel.poses(candidates.q, request.payload)
-    names = choose_candidates(nominal, request.parameters).names
+    names = _names(request)
     columns = [kernel.index[name] for name in names]
     _, J = kernel.frames_and_jacobian(kernel.theta0, poses, columns)
     variables = kernel.variables(kernel.theta0, poses)
@@ -166,6 +167,22 @@ def design_of(request: PoseRequest, candidates: Candidates) -> Design:
     test_points = np.asarray(request.test_points, dtype=float).reshape(-1, 3)
     checks = _check_rows(scaled, kernel, poses, test_points)
     return Design(root @ scaled, checks)
+
+
+def _names(request: PoseRequest) -> tuple[str, ...]:
+    """Parameters to identify.
+
+    Raises
+    ------
+    InvalidInput : a name that the robot does not have.
+    """
+    names = choose_candidates(request.model, request.parameters).names
+    known = set(parameter_names(request.model))
+    for name in names:
+        if name not in known:
+            raise InvalidInput(f"robot '{request.model.name}' has no parameter '{name}'")
+    terms = {full for term in request.model.terms for full in term.parameter_names}
+    return tuple(name for name in names if name not in terms)
 
 
 def _information_root(request: PoseRequest, candidates: Candidates) -> Array:

@@ -765,13 +765,12 @@ static int inside(const double *q)
     return 1;
 }
 
-/* Joint step of the nominal robot that takes the real tool to the target; 0 if a limit or a singularity forbids it. */
-static int step(const double *target, const double *real, double *q)
+/* Joint step of the nominal robot by the twist r of its tool; 0 if a limit or a singularity forbids it. */
+static int step(const double *r, double *q)
 {
-    double T[12], J[6 * N], r[6], A[N][N], b[N], next[N], largest = 0.0;
+    double T[12], J[6 * N], A[N][N], b[N], next[N], largest = 0.0;
     int i, j, k;
     chain(q, T, J);
-    difference(real, target, r);
     for (i = 0; i < N; ++i) {
         for (j = 0; j <= i; ++j) {
             double s = 0.0;
@@ -826,9 +825,10 @@ static int correct(const double *F, const double *real, double *q)
     return result;
 #else
     /* fewer than six joints: position before orientation, in joint space */
-    double target[12];
+    double target[12], r[6];
     multiply(WORLD_T_BASE, F, target);
-    return step(target, real, q) ? @P@_OK : @P@_BEYOND_LIMITS;
+    difference(real, target, r);
+    return step(r, q) ? @P@_OK : @P@_BEYOND_LIMITS;
 #endif
 }
 
@@ -852,7 +852,7 @@ int @P@_first_order(const double world_T_tool[12], const @P@_conditions *conditi
 int @P@_exact(const double world_T_tool[12], const @P@_conditions *conditions, const double near[N],
               double q[N], double *base_T_target, double *remaining)
 {
-    double F[12], real[12], r[6], size = HUGE_VAL, before;
+    double F[12], real[12], r[6], back[6], size = HUGE_VAL, before;
     int result, round, k, quick = 1;
     multiply(BASE_T_WORLD, world_T_tool, F);
     result = @P@_nominal_inverse(F, near, q);
@@ -861,8 +861,9 @@ int @P@_exact(const double world_T_tool[12], const @P@_conditions *conditions, c
         difference(world_T_tool, real, r);
         before = size;
         size = 0.0;
-        for (k = 0; k < (N >= 6 ? 6 : 3); ++k) {
-            size = fmax(size, fabs(r[k]));
+        for (k = 0; k < 6; ++k) {
+            size = (k < 3 || N >= 6) ? fmax(size, fabs(r[k])) : size;
+            back[k] = -r[k];
         }
         if (size <= 1e-10) {
             break;
@@ -873,7 +874,7 @@ int @P@_exact(const double world_T_tool[12], const @P@_conditions *conditions, c
         }
         /* joint steps while they gain much; near singularities the closed form of the corrected target */
         quick = quick && size < 0.25 * before;
-        if (!(quick && step(world_T_tool, real, q))) {
+        if (!(quick && step(back, q))) {
             quick = 0;
             result = correct(F, real, q);
         }
