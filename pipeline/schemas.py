@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError, model_validator
+from pydantic_core import PydanticCustomError
 
 from pipeline.yaml_io import YamlDocument, read_yaml
 from robcal.errors import InvalidInput
@@ -87,7 +88,8 @@ class Entry(BaseModel):
         known = _names(cls)
         for key in data:
             if key not in known:
-                raise ValueError(f"unknown key '{key}'{proposal(str(key), known)}")
+                told = f"unknown key '{key}'{proposal(str(key), known)}"
+                raise PydanticCustomError("unknown_key", "{told}", {"told": told, "key": str(key)})
         return data
 
 
@@ -136,7 +138,8 @@ def first_problem(document: YamlDocument, error: ValidationError) -> str:
     # An alternative (a | b) reports one problem for each branch; the deepest place is the branch that was meant.
     problem = max(error.errors(), key=lambda item: len(_place(item["loc"], document)))
     place = _place(problem["loc"], document)
-    line = document.line(place)
+    key = problem.get("ctx", {}).get("key") if problem["type"] == "unknown_key" else None
+    line = document.line(place if key is None else (*place, key))
     where = f"{document.path}, line {line}" if line else f"{document.path}"
     name = _dotted(place)
     told = problem["msg"].removeprefix("Value error, ")

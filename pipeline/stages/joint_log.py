@@ -94,8 +94,8 @@ def _check_unit(
         way, robot_way = float(np.std(measured, axis=0).max()), float(np.std(moved[pose], axis=0).max())
         if robot_way > 1e-3 and (way > 100 * robot_way or way < 0.01 * robot_way):
             raise InvalidInput(
-                f"{poses.path.parent}: the measured coordinates scatter by {way * 1000:.3g} mm while the robot moved by "
-                f"{robot_way * 1000:.3g} mm: the columns _mm must be in millimetres, check the unit of the measurements"
+                f"{poses.path.parent}: the measured coordinates scatter by {way * 1000:.3g} mm while the robot moved "
+                f"by {robot_way * 1000:.3g} mm: columns _mm must be in millimetres, check the unit of the measurements"
             )
 
 
