@@ -129,7 +129,7 @@ def _predicted(
     from pipeline.poses_table import read_poses
     from robcal.robot.kernel import Kernel
 
-    kernel = Kernel(model)
+    kernel = Kernel(model, "converged")
     predicted = {}
     for name, table in tables.items():
         poses = read_poses(table, campaign.robot, campaign.robot.payloads, to_predict=True)

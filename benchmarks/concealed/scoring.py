@@ -19,6 +19,11 @@ PERIODIC = {"phase_deg": 360.0, "azimuth_deg": 360.0}
 NOT_COMPARED = {"pose", "order", "from", "with", "threshold_Nm", "tau_h", "covariate", "term", "torque_scale"}
 
 
+VISIBLE = 3.0
+"""A name for an effect outside the library is wrong if what it cannot reproduce has at least this SNR; a name that
+reproduces the effect down to the noise is as good a model as the data can tell."""
+
+
 def score(scenario: Scenario, recording: Recording, truth: Truth, answer: Answer) -> dict[str, Any]:
     """Everything that the tables need about one run."""
     design = Design.of(truth)
@@ -89,8 +94,11 @@ def _first(effect: Effect, first: Mapping[str, Any], equal: Equivalence) -> dict
         "set_covers": named or len(others) < len(rivals),
         "set_size": len(others) + (0 if named else 1) + (1 if named or len(others) < len(rivals) else 0),
     }
-    if effect.cause in OUTSIDE:
-        out["wrongly_named"] = first["cause"] != "unknown" and not named
+    if effect.cause in OUTSIDE and first["cause"] != "unknown":
+        left = equal.design.snr([effect]) * float(np.sqrt(max(1.0 - out["cosine"] ** 2, 0.0)))
+        out |= {"left_snr": left, "wrongly_named": left > VISIBLE}
+    elif effect.cause in OUTSIDE:
+        out["wrongly_named"] = False
     if first["cause"] == effect.cause and here:
         inside, total = _intervals(effect, first)
         out |= {"intervals_inside": inside, "intervals": total}
