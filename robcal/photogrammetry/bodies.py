@@ -75,7 +75,7 @@ class Body:
     @property
     def known(self) -> NDArray[np.bool_]:
         """(t,) true where all three coordinates are known."""
-        return np.isfinite(self.points).all(axis=1)
+        return np.asarray(np.isfinite(self.points).all(axis=1))
 
     def index(self, ids: ArrayLike) -> IntArray:
         """Positions of ids in this body, -1 where the body has no such target."""

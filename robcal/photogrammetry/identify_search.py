@@ -149,7 +149,7 @@ def _dot_triples(semi_major: Array, diameters: Array) -> Iterator[IntArray]:
             relative = semi_major[list(chosen)]
             if relative.max() > 2.0 * relative.min() * diameters.max() / diameters.min():
                 continue
-        batch += permutations(chosen)
+        batch += permutations([int(i) for i in chosen])
         if len(batch) >= _BATCH:
             yield np.array(batch)
             batch = []
@@ -163,7 +163,7 @@ def _best(
 ) -> list[tuple[float, Array]]:  # fmt: skip
     p = transform(poses[:, None], body.points[candidates])
     seen = project(camera, p)
-    ok = np.isfinite(seen).all(axis=-1)
+    ok = np.asarray(np.isfinite(seen).all(axis=-1))
     distance, index = tree.query(np.where(ok[..., None], seen, -1e6), distance_upper_bound=tolerance)
     size = camera.fx * 0.5 * body.diameters[candidates] / np.where(p[..., 2] > 0, p[..., 2], np.nan)
     blob = semi_major[np.minimum(index, len(xy) - 1)]

@@ -67,7 +67,10 @@ def identify_station(
 def _marks(
     name: str, found: Mapping[tuple[str, int], IdentifiedImage], images: Mapping[int, Detections]
 ) -> StationMarks:
-    poses, ids, xy, covariance = [], [], [], []
+    poses: list[np.ndarray] = []
+    ids: list[np.ndarray] = []
+    xy: list[np.ndarray] = []
+    covariance: list[np.ndarray] = []
     for pose in sorted(images):
         image = found[name, pose]
         poses.append(np.full(len(image.rows), pose))
@@ -75,7 +78,8 @@ def _marks(
         xy.append(images[pose].xy[image.rows])
         covariance.append(images[pose].covariance[image.rows])
     if not poses:
-        return StationMarks(np.empty(0), np.empty(0), np.empty((0, 2)), np.empty((0, 2, 2)))
+        none = np.empty(0, dtype=np.int64)
+        return StationMarks(none, none, np.empty((0, 2)), np.empty((0, 2, 2)))
     return StationMarks(np.concatenate(poses), np.concatenate(ids), np.concatenate(xy), np.concatenate(covariance))
 
 

@@ -6,13 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from robcal.errors import DegenerateGeometry
 from robcal.imaging.detections import Detections, TargetKind
 from robcal.photogrammetry.bodies import Body, IntArray
-from robcal.photogrammetry.camera import Camera, project, project_with_jacobians
+from robcal.photogrammetry.camera import Camera, project_with_jacobians
 from robcal.photogrammetry.eccentric_circle import effective_point
-from robcal.photogrammetry.identify_search import Found, match_dots, search_body
+from robcal.photogrammetry.identify_search import match_dots, search_body
 from robcal.photogrammetry.resection import refine_poses, resect
 from robcal.transforms import Array, skew, transform
 
@@ -112,8 +113,8 @@ def identify_targets(
         if len(found) > 1:
             return IdentifiedImage(
                 none, none, None, "none", tuple(f.camera_T_body for f in found),
-                f"{len(found)} numberings of the dots fit equally well (the arrangement is symmetric): use coded targets "
-                "or a second camera",
+                f"{len(found)} numberings of the dots fit equally well (the arrangement is symmetric): "
+                "use coded targets or a second camera",
             )  # fmt: skip
         reason = why
     if len(rows):
@@ -121,7 +122,7 @@ def identify_targets(
     return IdentifiedImage(none, none, None, "none", (), reason)
 
 
-def _uncoded(body: Body) -> Array:
+def _uncoded(body: Body) -> NDArray[np.bool_]:
     return np.array([code is None for code in body.codes], dtype=bool)
 
 
@@ -219,5 +220,3 @@ def _predict(
     gate = np.where(np.isfinite(variance), _GATE * np.sqrt(np.maximum(variance, 0.01)), 0.0)
     return xy, gate, size
 
-
-__all__ = ["Found", "IdentifiedImage", "Prediction", "identify_targets", "project"]

@@ -76,7 +76,7 @@ def intersect(
     for c, cam in enumerate(cameras):
         rows = camera == c
         ideal[rows] = normalise(cam, xy[rows])
-    used = np.isfinite(ideal).all(axis=1)
+    used = np.asarray(np.isfinite(ideal).all(axis=1))
     T = world_T_camera[station]
     direction = np.einsum("mij,mj->mi", T[:, :3, :3], np.column_stack([ideal, np.ones(len(ideal))]))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
@@ -85,7 +85,7 @@ def intersect(
     A = sum_by(point, across, n)
     b = sum_by(point, np.einsum("mij,mj->mi", across, np.where(used[:, None], T[:, :3, 3], 0.0)), n)
     count = np.bincount(point[used], minlength=n).astype(np.int64)
-    regular = (count >= 2) & (np.linalg.eigvalsh(A)[:, 0] > 1e-9)
+    regular: NDArray[np.bool_] = (count >= 2) & (np.linalg.eigvalsh(A)[:, 0] > 1e-9)
     p = np.full((n, 3), np.nan)
     p[regular] = np.linalg.solve(A[regular], b[regular][..., None])[..., 0]
 
@@ -128,7 +128,7 @@ def intersect(
         T2 = np.einsum("mi,mij,mj->m", r, np.linalg.pinv(V, rcond=1e-9, hermitian=True), r)
         worst = np.zeros(n)
         np.maximum.at(worst, point, np.where(used, T2, 0.0))
-        drop = used & (count[point] >= 3) & (T2 == worst[point]) & (T2 > critical**2 + 2)
+        drop = used & (count[point] >= 3) & (worst[point] == T2) & (critical**2 + 2 < T2)
         if not drop.any():
             break
         used = used & ~drop

@@ -1,11 +1,13 @@
-"""From points to frames: the distance criterion, then the body fitted onto its measured targets with full covariance."""
+"""From points to frames: the distance criterion, then the body fitted onto its targets with full covariance."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import stats
 
 from robcal.errors import DegenerateGeometry, InvalidInput
@@ -17,7 +19,7 @@ from robcal.photogrammetry.distance_criterion import (
     make_pairs,
     robust_scale,
 )
-from robcal.photogrammetry.frame_fit import fit_frames
+from robcal.photogrammetry.frame_fit import FrameFit, fit_frames
 from robcal.photogrammetry.measured_points import MeasuredPoints, RejectedPoint
 from robcal.photogrammetry.recurring import Recurring, find_recurring
 from robcal.photogrammetry.unknown_body import body_from_points
@@ -51,7 +53,7 @@ class PairDeviations:
     expected: Array
     sigma: Array
     tolerance: Array
-    accepted: Array
+    accepted: NDArray[np.bool_]
 
     @property
     def deviation(self) -> Array:
@@ -155,17 +157,23 @@ def measure_frames(
     left_out = _leave_out(body, recurring, notes)
     keep, rejected_poses, dropped = _eliminate(body, pose, row, table, judged, left_out)
     rejected += dropped
-    fit = fit_frames(pose[keep], row[keep], p[keep], C[keep], body, _station(points, at[keep]), points.station_covariance)
+    station = _station(points, at[keep])
+    fit = fit_frames(pose[keep], row[keep], p[keep], C[keep], body, station, points.station_covariance)
+    if sigma is not None and fit.redundancy.sum() >= 30:
+        # lengths gave a robust first value; the accepted fits give the efficient one
+        scale = float(np.sqrt(fit.chi2.sum() / fit.redundancy.sum()))
+        sigma *= scale
+        fit = replace(fit, covariance=fit.covariance * scale**2, chi2=fit.chi2 / scale**2)
     reasons = [
         _bad_fit(fit.chi2[i], int(fit.redundancy[i]), fit.covariance[i], factor) for i in range(len(fit.pose))
     ]
     misfits = [r is not None and r.startswith(_MISFIT) for r in reasons]
     if sum(misfits) > _TOO_MANY * len(reasons):
-        notes.append(f"in {sum(misfits)} of {len(reasons)} poses the body does not fit its points: evidence, not rejected")
+        notes.append(f"in {sum(misfits)} of {len(reasons)} poses the body does not fit: evidence, not rejected")
         reasons = [None if bad else r for r, bad in zip(reasons, misfits, strict=True)]
     good = np.array([r is None for r in reasons], dtype=bool)
     rejected_poses += [RejectedPose(int(q), r) for q, r in zip(fit.pose, reasons, strict=True) if r is not None]
-    out = _assemble(points, fit, good, method, body)
+    out = _assemble(points, fit, good, method)
     with_frame = set(out["pose"].tolist())
     rejected_poses = [r for r in rejected_poses if r.pose not in with_frame]
     named = {r.pose for r in rejected_poses} | with_frame
@@ -244,7 +252,7 @@ def _judge(
     note = None
     if len(poses) >= 5 and len(violating) > _TOO_MANY * len(poses):
         text = f"{1e3 * tolerance:.3g} mm" if tolerance is not None else f"{sigma_factor:g} sigma"
-        note = f"{len(violating)} of {len(poses)} poses violate the tolerance of {text}: taken as evidence, not rejected"
+        note = f"{len(violating)} of {len(poses)} poses violate the tolerance of {text}: evidence, not rejected"
         limit = np.maximum(limit, 2 * sigma_factor * max(factor, 1.0) * sigma)
     pairs = PairDeviations(
         table.pose, body.ids[a], body.ids[b], table.distance, file, expected, sigma, limit, np.abs(off) <= limit
@@ -266,7 +274,7 @@ def _leave_out(body: Body, recurring: Recurring, notes: list[str]) -> tuple[int,
 
 def _eliminate(
     body: Body, pose: IntArray, row: IntArray, table: PairTable, judged: PairDeviations, left_out: tuple[int, ...]
-) -> tuple[Array, list[RejectedPose], list[RejectedPoint]]:
+) -> tuple[NDArray[np.bool_], list[RejectedPose], list[RejectedPoint]]:
     """Points that stay, poses rejected, points rejected."""
     keep = ~np.isin(body.ids[row], left_out)
     poses: list[RejectedPose] = []
@@ -331,7 +339,7 @@ def _bad_fit(chi2: float, redundancy: int, covariance: Array, factor: float) -> 
     return None
 
 
-def _assemble(points: MeasuredPoints, fit, good: Array, method: str, body: Body) -> dict:  # type: ignore[no-untyped-def,type-arg]
+def _assemble(points: MeasuredPoints, fit: FrameFit, good: NDArray[np.bool_], method: str) -> dict[str, Any]:
     """Frames from points and frames by resection, in the order of the poses."""
     pose, T, C, common = fit.pose[good], fit.world_T_body[good], fit.covariance[good], fit.common_covariance[good]
     methods = [method] * int(good.sum())

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import stats
 
 from robcal.errors import DegenerateGeometry
@@ -14,7 +15,7 @@ from robcal.photogrammetry.eccentric_circle import effective_point
 from robcal.photogrammetry.grouping import sum_by
 from robcal.photogrammetry.intersection import intersect
 from robcal.photogrammetry.measured_points import MeasuredPoints, RejectedPoint, ResectedPoses
-from robcal.photogrammetry.resection import Resection, refine_poses, resect_images
+from robcal.photogrammetry.resection import PoseFit, Resection, refine_poses, resect_images
 from robcal.photogrammetry.station_adjustment import interior_basis, linearise
 from robcal.photogrammetry.station_network import MarkTable, StationMarks, StationOrientation, Unknowns
 from robcal.transforms import Array, invert, skew, transform
@@ -54,7 +55,7 @@ def measure_points(
     world_T_body = _known_poses(orientation, poses)
     xy = _centred(orientation, table, pose_row, world_T_body, carried)
     key = pose_row * (len(carried) + 1) + table.target
-    keys, point = np.unique(key, return_inverse=True)
+    point = np.unique(key, return_inverse=True)[1]
     rays = np.bincount(point)
     several = rays[point] >= 2
     sub_keys, sub_point = np.unique(key[several], return_inverse=True)
@@ -74,7 +75,9 @@ def measure_points(
         )  # fmt: skip
         pose_of = poses[sub_keys // (len(carried) + 1)]
         target_of = carried.ids[sub_keys % (len(carried) + 1)]
-        keep, inconsistent = _consistent(out.chi2, out.n_cameras, out.p_world, pose_of, target_of, critical, rejected, suspect)
+        keep, inconsistent = _consistent(
+            out.chi2, out.n_cameras, out.p_world, pose_of, target_of, critical, rejected, suspect
+        )
         redundancy = 2 * out.n_cameras - 3
         res = np.sqrt(np.maximum(out.chi2, 0) / np.maximum(redundancy, 1))[keep]
         J = np.concatenate(
@@ -114,7 +117,7 @@ def _table(
     """All marks not left out by the orientation: table (pose unused), pose numbers, variance factor per mark."""
     banned = {(r.camera, r.pose, r.target) for r in orientation.rejected if r.kind == "outlier"}
     radius, normals = 0.5 * body.diameters, body.estimated_normals()
-    columns: list[tuple[Array, ...]] = []
+    columns: list[tuple[np.ndarray, ...]] = []
     for c, name in enumerate(orientation.names):
         m = marks.get(name)
         if m is None or len(m) == 0:
@@ -175,11 +178,11 @@ def _centred(
 def _consistent(
     chi2: Array, n_cameras: IntArray, p: Array, pose: IntArray, target: IntArray, critical: float,
     rejected: list[RejectedPoint], suspect: set[int],
-) -> tuple[Array, tuple[int, ...]]:  # fmt: skip
+) -> tuple[NDArray[np.bool_], tuple[int, ...]]:  # fmt: skip
     """Points whose rays agree. Where most points of a pose fail it is not the points: they stay, the pose is named;
     but in a ``suspect`` pose, whose images the orientation found to contradict one another, they go."""
     level = 2 * stats.norm.sf(critical)
-    finite = np.isfinite(p).all(axis=1)
+    finite = np.asarray(np.isfinite(p).all(axis=1))
     limit = stats.chi2.isf(level, np.maximum(2 * n_cameras - 3, 1))
     fails = finite & (chi2 > limit)
     inconsistent = []
@@ -239,43 +242,47 @@ def _resect_poses(
                 rejected.append(RejectedPoint(int(q), -1, f"camera {orientation.names[c]}: {fit}"))
     if not starts:
         return None
-    fit, which, tile = _fit_all(orientation, table, scaled, number, rows, starts, body)
+    best_fit, which, tile = _fit_all(orientation, table, scaled, number, rows, starts, body)
     own = np.array([q for q, _ in starts])
     chosen: list[int] = []
     for q in np.unique(own):
         candidates = np.flatnonzero(own == q)
-        candidates = candidates[np.argsort(fit.cost[candidates])]
+        candidates = candidates[np.argsort(best_fit.cost[candidates])]
         best = candidates[0]
-        redundancy = int(fit.redundancy[best])
-        variance = max(1.0, fit.cost[best] / max(1, redundancy))
+        redundancy = int(best_fit.redundancy[best])
+        variance = max(1.0, best_fit.cost[best] / max(1, redundancy))
         distinct = [
             k for k in candidates[1:]
-            if np.trace(fit.reference_T_body[k][:3, :3].T @ fit.reference_T_body[best][:3, :3]) < 3 - 1e-4
+            if np.trace(best_fit.reference_T_body[k][:3, :3].T @ best_fit.reference_T_body[best][:3, :3]) < 3 - 1e-4
         ]  # fmt: skip
         if redundancy <= 0:
             rejected.append(RejectedPoint(int(q), -1, "resection: three marks alone cannot be verified"))
-        elif stats.chi2.sf(fit.cost[best], redundancy) < 1e-9:
+        elif stats.chi2.sf(best_fit.cost[best], redundancy) < 1e-9:
             rejected.append(RejectedPoint(int(q), -1, "resection: the marks do not fit the body"))
-        elif distinct and fit.cost[distinct[0]] < fit.cost[best] + 14 * variance:
+        elif distinct and best_fit.cost[distinct[0]] < best_fit.cost[best] + 14 * variance:
             rejected.append(
                 RejectedPoint(int(q), -1, "resection: a plane seen by one camera, two poses fit equally well")
             )
-        elif not np.isfinite(fit.covariance[best]).all():
+        elif not np.isfinite(best_fit.covariance[best]).all():
             rejected.append(RejectedPoint(int(q), -1, "resection: the pose is not determined"))
         else:
             chosen.append(int(best))
     if not chosen:
         return None
-    common = _common_covariance(orientation, table, scaled, fit.reference_T_body, which, tile, body)
+    common = _common_covariance(orientation, table, scaled, best_fit.reference_T_body, which, tile, body)
     seen_by = [np.unique(table.camera[tile[which == k]]) for k in chosen]
     return ResectedPoses(
-        own[chosen], fit.reference_T_body[chosen], fit.covariance[chosen], common[chosen],
+        own[chosen], best_fit.reference_T_body[chosen], best_fit.covariance[chosen], common[chosen],
         np.array([len(s) for s in seen_by], dtype=np.int64),
         tuple(tuple(sorted({int(i) for i in body.ids[table.target[tile[which == k]]]})) for k in chosen),
     )  # fmt: skip
 
 
-def _fit_all(orientation, table, scaled, number, rows, starts, body):  # type: ignore[no-untyped-def]
+def _fit_all(
+    orientation: StationOrientation, table: MarkTable, scaled: Array, number: IntArray, rows: IntArray,
+    starts: list[tuple[int, Array]], body: Body,
+) -> tuple[PoseFit, IntArray, IntArray]:  # fmt: skip
+    """Refine all start poses with the marks of all cameras: fit, start number and table row of each mark used."""
     tiles = [rows[number[rows] == q] for q, _ in starts]
     tile = np.concatenate(tiles)
     which = np.repeat(np.arange(len(starts)), [len(t) for t in tiles])

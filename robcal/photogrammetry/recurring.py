@@ -19,8 +19,8 @@ _MIN_POSES = 5
 
 @dataclass(frozen=True)
 class TargetShift:
-    """A target whose place on the body is not that of its file: id, shift (3,) m in body coordinates (true minus file),
-    its covariance, the chi-square of the shift and, where two targets stand in each other's place, the other id."""
+    """A target that is not where its file says: id, shift (3,) m in body coordinates (true minus file), its covariance,
+    the chi-square of the shift and, where two targets stand in each other's place, the other id."""
 
     target: int
     shift: Array
@@ -223,8 +223,10 @@ def _shifts(
         base = np.mean(sigma[stay] ** 2)
         covariance = np.diag(sigma[i] ** 2 + base) + body.marginal(i)
         statistic = float(shift @ np.linalg.solve(covariance, shift))
-        near = [k for k in removed if k != i and np.linalg.norm(moved[i] - body.points[k]) < 0.1 * np.linalg.norm(shift)]
-        out.append(TargetShift(int(body.ids[i]), shift, covariance, statistic, int(body.ids[near[0]]) if near else None))
+        reach = 0.1 * np.linalg.norm(shift)
+        near = [k for k in removed if k != i and np.linalg.norm(moved[i] - body.points[k]) < reach]
+        other = int(body.ids[near[0]]) if near else None
+        out.append(TargetShift(int(body.ids[i]), shift, covariance, statistic, other))
     ids = {t.target: t for t in out}
     # a swap is mutual
     return tuple(
@@ -241,7 +243,8 @@ def _statement(
         if t.swapped_with is not None and t.target < t.swapped_with:
             parts.append(f"targets {t.target} and {t.swapped_with} of body {body.name} are swapped")
         elif t.swapped_with is None:
-            parts.append(f"target {t.target} of body {body.name} is {1e3 * np.linalg.norm(t.shift):.3g} mm off its file")
+            size = 1e3 * np.linalg.norm(t.shift)
+            parts.append(f"target {t.target} of body {body.name} is {size:.3g} mm off its file")
     if scale:
         parts.append(f"all lengths are measured {1e6 * scale:+.0f} ppm off those of body {body.name}")
     if unexplained:

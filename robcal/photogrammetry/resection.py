@@ -296,7 +296,7 @@ def resect_images(
         tasks += [(i, T, rows) for T in starts]
     solutions = _refine_tasks(data, tasks, k)
     again: list[tuple[int, Array, IntArray]] = []
-    inside = {i: rows for i, rows in enumerate(rows_of)}
+    inside = dict(enumerate(rows_of))
     for i, rows in enumerate(rows_of):
         m = len(rows)
         if i in failed or m <= 3:

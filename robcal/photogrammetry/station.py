@@ -94,7 +94,7 @@ def orient_station(
     good = [s for s in images if (s.camera, s.pose) not in bad]
     rejected += _left_out_by_resection(names, marks, good)
     if not good:
-        raise DegenerateGeometry("the cameras contradict one another in every pose: images and poses do not belong together")
+        raise DegenerateGeometry("the cameras contradict one another in every pose: images of different poses")
     bodies = start_bodies(good, marks, start, exterior, body, options.default_sigma_px)
     ambiguous = [p for p, (_, cost, second, n) in bodies.items() if n == 1 and second < cost + 14 * max(1.0, cost / 4)]
     several = any(n > 1 for _, _, _, n in bodies.values())
@@ -137,7 +137,8 @@ def _left_out_by_resection(
     for s in images:
         m = marks[s.camera]
         for i in np.setdiff1d(np.flatnonzero(m.pose == s.pose), s.rows):
-            out.append(RejectedMark(names[s.camera], s.pose, int(m.target[i]), "far from where its image's pose puts it"))
+            reason = "far from where the pose of its image puts it"
+            out.append(RejectedMark(names[s.camera], s.pose, int(m.target[i]), reason))
     return out
 
 
@@ -224,8 +225,8 @@ def _result(
     C = design.reduced_inverse[-3 * t :, -3 * t :].copy()
     rest = np.setdiff1d(np.arange(t), seen)
     if state.body.covariance is not None and len(rest):
-        at = (3 * rest[:, None] + np.arange(3)).ravel()
-        C[np.ix_(at, at)] = state.body.covariance[np.ix_(at, at)]
+        unseen = (3 * rest[:, None] + np.arange(3)).ravel()
+        C[np.ix_(unseen, unseen)] = state.body.covariance[np.ix_(unseen, unseen)]
     cameras_of_pose = np.zeros((len(state.poses), c), dtype=bool)
     cameras_of_pose[marks.pose, marks.camera] = True
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -125,7 +125,7 @@ class Adjusted:
 def interior_offset(x: Unknowns, prior: Prior) -> Array:
     """(c, 9) present minus prior interior orientation, in the adjusted unknowns."""
     difference = x.interior - prior.interior
-    return np.linalg.solve(interior_basis(prior.interior), difference[..., None])[..., 0]
+    return np.asarray(np.linalg.solve(interior_basis(prior.interior), difference[..., None])[..., 0])
 
 
 def global_columns(marks: MarkTable, e: int, c: int) -> NDArray[np.int64]:
@@ -186,7 +186,7 @@ def _normal(lin: Linearisation, marks: MarkTable, x: Unknowns, prior: Prior, wei
     b = A.T @ r.ravel() + b0
     W = (A.T @ P).toarray()
     V = sum_by(marks.pose, np.swapaxes(B, -1, -2) @ B, p)
-    v = (P.T @ r.ravel()).reshape(p, 6)
+    v = np.asarray(P.T @ r.ravel()).reshape((p, 6))
     scale = np.sqrt(np.maximum(np.einsum("pii->pi", V), 1e-300))
     seen = np.einsum("pii->pi", V).min(axis=1) > 0  # a pose whose marks were all left out keeps its value
     Vi = np.zeros_like(V)
@@ -204,7 +204,7 @@ def _solve_scaled(S: Array, b: Array, names: list[str]) -> tuple[Array, Array]:
     try:
         factor = linalg.cho_factor(unit, lower=True)
     except linalg.LinAlgError:
-        values, vectors = np.linalg.eigh(unit)
+        vectors = np.linalg.eigh(unit)[1]
         weak = np.abs(vectors[:, 0])
         tied = [names[i] for i in np.argsort(weak)[::-1][:4] if weak[i] > 0.2]
         raise NotIdentifiable(

@@ -56,7 +56,7 @@ def resolve_contradictions(state: StationState, adjusted: Adjusted) -> Cleaned:
 
 def _drop_image(state: StationState, found: Evidence) -> list[RejectedMark]:
     """Leave out an image; of two images that contradict one another, both."""
-    column = int(np.searchsorted(state.poses, found.pose))
+    column = int(np.searchsorted(state.poses, -1 if found.pose is None else found.pose))
     of_pose = state.marks.pose == column
     cameras = np.unique(state.marks.camera[of_pose])
     which = cameras if len(cameras) <= 2 else np.array([state.names.index(found.where)])
@@ -108,13 +108,16 @@ def _strongest(state: StationState, adjusted: Adjusted) -> Evidence | None:
 def _worst_target(state: StationState, adjusted: Adjusted) -> Evidence | None:
     """The target whose given coordinates stand out from all others' (not merely a body of modest accuracy)."""
     seen = np.unique(state.marks.target)
-    free = np.diag(state.prior.points_weight)[3 * seen] < 10.0
+    weight = state.prior.points_weight
+    if weight is None:
+        return None
+    free = np.diag(weight)[3 * seen] < 10.0
     if (~free).sum() <= 3:
         return None
     t = len(state.body)
     Q = adjusted.design.reduced_inverse[-3 * t :, -3 * t :]
     usable = seen[~free]
-    scan = scan_targets(state.unknowns.points, state.prior.points, state.prior.points_weight, Q, usable)
+    scan = scan_targets(state.unknowns.points, state.prior.points, weight, Q, usable)
     i = int(usable[np.argmax(scan.statistic[usable])])
     if scan.statistic[i] < _TARGET_LIMIT * max(1.0, scan.rest[i] / float(stats.chi2.median(3))):
         return None
@@ -182,7 +185,7 @@ def snoop(state: StationState) -> tuple[Adjusted, tuple[RejectedMark, ...]]:
             image = state.marks.camera * len(state.poses) + state.marks.pose
             worst = np.zeros(int(image.max()) + 1)
             np.maximum.at(worst, image, T2)
-            out = (T2 > level) & (T2 == worst[image])
+            out = (level < T2) & (worst[image] == T2)
             if not out.any():
                 break
             rejected += [

@@ -117,7 +117,8 @@ class Evidence:
 class RejectedMark:
     """A mark left out: camera, pose number, target id (-1: the whole image) and why.
 
-    ``kind``: 'outlier' (one mark), 'recurring' (most marks of its target: the target is to blame), 'contradiction' (the image does not fit the other cameras) or 'no_pose' (the image
+    ``kind``: 'outlier' (one mark), 'recurring' (most marks of its target: the target is to blame), 'contradiction'
+    (the image does not fit the other cameras) or 'no_pose' (the image
     alone carries no pose; its marks may still be intersected).
     """
 
@@ -247,7 +248,7 @@ class StationOrientation:
     @property
     def world_T_camera(self) -> dict[str, Array]:
         """Exterior orientation of each camera as it was at the first pose."""
-        first = {}
+        first: dict[str, Array] = {}
         for e in np.argsort(self.exterior_first_pose, kind="stable"):
             first.setdefault(self.names[self.exterior_camera[e]], self.world_T_exterior[e])
         return {name: first[name] for name in self.names}

@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from robcal.photogrammetry.bodies import IntArray
 from robcal.photogrammetry.grouping import sum_by
@@ -58,23 +59,22 @@ def scan_moves(design: StationDesign, marks: MarkTable, cameras: int, poses: int
     own = own - X @ np.swapaxes(with_pose, -1, -2)
     with_global = with_global - X @ np.moveaxis(design.coupling, 0, -1)[pose]
     shape = (cameras, poses)
-    score, own = score.reshape(*shape, 6), own.reshape(*shape, 6, 6)
-    with_global = with_global.reshape(*shape, 6, g)
+    s, o, w = score.reshape(*shape, 6), own.reshape(*shape, 6, 6), with_global.reshape(*shape, 6, g)
 
     def tail(a: Array) -> Array:
         return np.flip(np.cumsum(np.flip(a, axis=1), axis=1), axis=1)
 
     seen = np.bincount(group, minlength=n).reshape(shape) > 0
-    before = np.cumsum(seen, axis=1) - seen
+    before: Array = np.cumsum(seen, axis=1) - seen.astype(float)
     after = tail(seen.astype(float))
     usable = (before >= 2) & (after >= 2)
-    stat, estimate, covariance = _statistics(tail(score), tail(own), tail(with_global), design, usable)
-    single = _statistics(score, own, with_global, design, seen)[0]
+    stat, estimate, covariance = _statistics(tail(s), tail(o), tail(w), design, usable)
+    single = _statistics(s, o, w, design, seen)[0]
     return MoveScan(stat, single, estimate, covariance)
 
 
 def _statistics(
-    score: Array, own: Array, with_global: Array, design: StationDesign, usable: Array
+    score: Array, own: Array, with_global: Array, design: StationDesign, usable: NDArray[np.bool_]
 ) -> tuple[Array, Array, Array]:
     M = own - with_global @ design.reduced_inverse @ np.swapaxes(with_global, -1, -2)
     M = 0.5 * (M + np.swapaxes(M, -1, -2))

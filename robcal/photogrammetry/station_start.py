@@ -233,8 +233,8 @@ def connect_cameras(
             roots = [i for i in left if i in stated]
             if not roots or not stated:
                 raise InvalidInput(
-                    f"camera {names[left[0]]} shares no pose with {names[root]}: it cannot be oriented. Record poses in "
-                    f"which both see at least three targets, or state world_T_camera in its camera file"
+                    f"camera {names[left[0]]} shares no pose with {names[root]}: it cannot be oriented. Record poses "
+                    f"in which both see at least three targets, or state world_T_camera in its camera file"
                 )
             root = roots[0]
     bad = [key for key, n in against.items() if n > for_it.get(key, 0)]
@@ -252,8 +252,8 @@ def _refuse_slipped(
         support = vote_relative([a[p] for p in common], [b[p + shift] for p in common])[1]
         if support.sum() > 0.7 * len(common):
             raise InvalidInput(
-                f"the images of camera {second} are slipped by {abs(shift)} against those of {first} (what {first} shows in "
-                f"a pose, {second} shows {abs(shift)} {'later' if shift > 0 else 'earlier'}; so they agree in "
+                f"the images of camera {second} are slipped by {abs(shift)} against those of {first} (what "
+                f"{first} shows in a pose, {second} shows {abs(shift)} {'later' if shift > 0 else 'earlier'}; so they agree in "
                 f"{int((support > 0.1).sum())} of {len(common)} poses): rename them"
             )
     raise InvalidInput(
@@ -283,7 +283,7 @@ def start_bodies(
             for T in s.candidates:
                 candidates.append(world_T_camera[s.camera] @ T)
                 owner.append(pose)
-    parts: dict[str, list[Array]] = {"which": [], "camera": [], "points": [], "xy": [], "covariance": []}
+    parts: dict[str, list[np.ndarray]] = {"which": [], "camera": [], "points": [], "xy": [], "covariance": []}
     for k, pose in enumerate(owner):
         for s in by_pose[pose]:
             n = len(s.rows)

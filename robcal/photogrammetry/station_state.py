@@ -125,8 +125,10 @@ class StationState:
 
     def release_target(self, row: int) -> None:
         """Stop using the given coordinates of a target (a weak prior of 1 m stays)."""
-        C = np.linalg.inv(self.prior.points_weight)
-        self.prior = replace(self.prior, points_weight=np.linalg.inv(_released(C, row)))
+        if self.prior.points_weight is None:
+            return
+        C = np.asarray(np.linalg.inv(self.prior.points_weight))
+        self.prior = replace(self.prior, points_weight=np.asarray(np.linalg.inv(_released(C, row))))
 
     def add_epoch(self, camera: int, first_pose: int) -> None:
         """Give a camera another exterior orientation from a pose number on."""
@@ -203,7 +205,7 @@ def assemble(
 ) -> StationState:
     """One table of all marks of the poses in ``bodies``, start values of all unknowns and their priors."""
     poses = np.array(sorted(bodies), dtype=np.int64)
-    rows: dict[str, list[Array]] = {k: [] for k in ("camera", "pose", "target", "xy", "covariance")}
+    rows: dict[str, list[np.ndarray]] = {k: [] for k in ("camera", "pose", "target", "xy", "covariance")}
     for s in images:
         if s.pose not in bodies:
             continue

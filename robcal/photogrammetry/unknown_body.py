@@ -10,6 +10,7 @@ from __future__ import annotations
 from itertools import combinations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from robcal.errors import DegenerateGeometry
 from robcal.photogrammetry.bodies import Body, IntArray, line_ratio
@@ -17,7 +18,7 @@ from robcal.photogrammetry.measured_points import MeasuredPoints
 from robcal.transforms import Array, fit_frame, gram_schmidt_frame, invert, transform
 
 
-def body_from_points(points: MeasuredPoints, use: Array, ids: IntArray | None = None) -> Body:
+def body_from_points(points: MeasuredPoints, use: NDArray[np.bool_], ids: IntArray | None = None) -> Body:
     """Body of the measured targets in the Gram-Schmidt frame of its best triangle.
 
     The triangle: of those seen together most often, the one of the largest area; its targets in the order of the body.
@@ -58,15 +59,15 @@ def body_from_points(points: MeasuredPoints, use: Array, ids: IntArray | None = 
     return Body("unknown", np.array(wanted, dtype=np.int64), shape)
 
 
-def _triangle(p: Array, seen: Array) -> list[int]:
+def _triangle(p: Array, seen: NDArray[np.bool_]) -> list[int]:
     best: tuple[tuple[int, float], list[int]] | None = None
     t = p.shape[1]
     order = np.argsort(-seen.sum(axis=0), kind="stable")[:12]
     for chosen in combinations(sorted(int(i) for i in order), 3):
-        rows = seen[:, chosen].all(axis=1)
+        rows = seen[:, list(chosen)].all(axis=1)
         if not rows.any():
             continue
-        q = p[np.ix_(rows, chosen)]
+        q = p[rows][:, list(chosen)]
         if line_ratio(q[0]) < 0.02:
             continue
         area = float(np.median(np.linalg.norm(np.cross(q[:, 1] - q[:, 0], q[:, 2] - q[:, 0]), axis=1)))

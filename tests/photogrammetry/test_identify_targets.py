@@ -1,0 +1,120 @@
+"""Identification: codes, prediction, geometry alone, and the refusal of symmetric arrangements."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from robcal.imaging.detections import TargetKind
+from robcal.photogrammetry.bodies import Body
+from robcal.photogrammetry.camera import Camera, project
+from robcal.photogrammetry.identify_station import identify_station
+from robcal.photogrammetry.identify_targets import Prediction, identify_targets
+from robcal.transforms import exp_so3, frame, invert, retract, transform
+from tests.photogrammetry.stations import PLATE, simulate
+
+CAMERA = Camera(2448, 2048, 3600.0, 3600.0, 1220.0, 1030.0, -0.08, 0.05, 2e-4, -1e-4, 0.0)
+ROUGH = Camera(2448, 2048, 3500.0, 3500.0, 1223.5, 1023.5)
+POSE = frame(exp_so3([0.3, -0.2, 1.0]), [0.05, -0.1, 2.2])
+
+
+def _detections(body, camera, camera_T_body, coded, rng, distractors):
+    """Dots of a body and others at random, in random order; returns them and the true id of each (-1: distractor)."""
+    p = transform(camera_T_body, body.points)
+    xy = project(camera, p) + rng.normal(size=(len(p), 2)) * 0.02
+    size = np.r_[camera.fx * 0.006 / p[:, 2], rng.uniform(2, 15, distractors)]
+    xy = np.r_[xy, rng.uniform([0, 0], [2448, 2048], (distractors, 2))]
+    truth = np.r_[body.ids, -np.ones(distractors, dtype=int)]
+    code = np.r_[np.where(coded, body.ids, -1), -np.ones(distractors, dtype=int)]
+    order = rng.permutation(len(xy))
+    d = SimpleNamespace(
+        shape=(2048, 2448), xy=xy[order], covariance=np.tile(np.eye(2) * 4e-4, (len(xy), 1, 1)),
+        semi_axes=np.column_stack([size, 0.8 * size])[order], code=code[order],
+        kind=np.where(code[order] >= 0, TargetKind.RING12, TargetKind.DOT),
+    )  # fmt: skip
+    return d, truth[order]
+
+
+def _body(points, coded=None):
+    t = len(points)
+    codes = tuple("ring12" if c else None for c in (np.zeros(t, bool) if coded is None else coded))
+    return Body("plate", 7 * np.arange(1, t + 1), np.asarray(points, float), None, codes, np.full(t, 0.012))
+
+
+def test_codes_extend_to_uncoded_dots():
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(-0.3, 0.3, (20, 2)), np.zeros(20)])
+    coded = np.arange(20) < 6
+    body = _body(points, coded)
+    d, truth = _detections(body, CAMERA, POSE, coded, rng, 10)
+    d.code[np.flatnonzero(d.code == 7)] = -1  # one code unreadable: then it is a dot like the others
+    found = identify_targets(d, body, ROUGH)
+    assert found.method == "codes"
+    assert np.array_equal(truth[found.rows], found.ids)
+    assert len(found.ids) >= 18
+
+
+def test_misread_code_is_thrown_out():
+    rng = np.random.default_rng(1)
+    body = _body(np.column_stack([rng.uniform(-0.3, 0.3, (10, 2)), np.zeros(10)]), np.ones(10, bool))
+    d, truth = _detections(body, CAMERA, POSE, np.ones(10, bool), rng, 0)
+    a, b = np.flatnonzero(d.code == 7)[0], np.flatnonzero(d.code == 70)[0]
+    d.code[[a, b]] = d.code[[b, a]]
+    found = identify_targets(d, body, ROUGH)
+    assert np.array_equal(truth[found.rows], found.ids)
+    assert len(found.ids) >= 8
+
+
+@pytest.mark.parametrize("distractors", [0, 8])
+def test_five_uncoded_dots(distractors):
+    rng = np.random.default_rng(2)
+    body = _body(PLATE)
+    for tilt in ([0.3, -0.2, 1.0], [-0.4, 0.3, -2.0], [0.1, 0.5, 3.0]):
+        d, truth = _detections(body, CAMERA, frame(exp_so3(tilt), [0, 0, 2.5]), np.zeros(5, bool), rng, distractors)
+        found = identify_targets(d, body, ROUGH)
+        assert found.method == "search"
+        assert np.array_equal(truth[found.rows], found.ids)
+        assert len(found.ids) == 5
+
+
+def test_symmetric_arrangement_is_refused_and_prediction_resolves_it():
+    rng = np.random.default_rng(3)
+    body = _body([[0, 0, 0], [0.2, 0, 0], [0.2, 0.2, 0], [0, 0.2, 0], [0.1, 0.1, 0]])
+    d, truth = _detections(body, CAMERA, POSE, np.zeros(5, bool), rng, 2)
+    found = identify_targets(d, body, ROUGH)
+    assert found.method == "none"
+    assert "symmetric" in found.reason
+    near = retract(POSE, [0.002, -0.001, 0.003, 0.002, 0.001, -0.002])
+    found = identify_targets(d, body, CAMERA, predictions=[Prediction(near, None, 4.0)])
+    assert found.method == "prediction"
+    assert np.array_equal(truth[found.rows], found.ids)
+    assert len(found.ids) == 5
+
+
+def test_dots_of_something_else_are_refused():
+    rng = np.random.default_rng(4)
+    body = _body(PLATE)
+    d, truth = _detections(body, CAMERA, POSE, np.zeros(5, bool), rng, 9)
+    keep = truth < 0
+    for name in ("xy", "covariance", "semi_axes", "code", "kind"):
+        setattr(d, name, getattr(d, name)[keep])
+    found = identify_targets(d, body, ROUGH)
+    assert len(found.ids) == 0
+    assert found.reason
+
+
+def test_station_of_uncoded_dots():
+    rng = np.random.default_rng(5)
+    s = simulate(poses=8)
+    body = Body("plate", s.body.ids, s.body.points, s.body.covariance, (None,) * 5, np.full(5, 0.012))
+    detections, truth = {}, {}
+    for name, camera in s.cameras.items():
+        detections[name] = {}
+        for pose in range(8):
+            T = invert(s.world_T_camera[name]) @ s.world_T_body[pose]
+            detections[name][pose], truth[name, pose] = _detections(body, camera, T, np.zeros(5, bool), rng, 5)
+    result = identify_station(detections, body, s.rough)
+    assert not result.problems
+    for key, image in result.images.items():
+        assert np.array_equal(truth[key][image.rows], image.ids)
+    assert sum(len(m) for m in result.marks.values()) >= 78
