@@ -28,7 +28,7 @@ PLAUSIBLE_ANGLE = 2e-3
 """The same for angles (rad), and for what an elasticity turns its angle at the largest moment met."""
 
 PLAUSIBLE_START = 0.1
-"""Base and tool are not known beforehand, but what the data leave open by more than this (m, rad) stays as constructed."""
+"""Base and tool are not known beforehand; what the data leave open by more than this (m, rad) stays as constructed."""
 
 SAME_POSE = 1e-4
 """Joint angles (rad) within which poses count as repetitions of one another."""

@@ -45,6 +45,8 @@ Array = NDArray[np.float64]
 
 LATE_SHARE = 0.2
 """Share of the plausible sigma below which a parameter may enter that was dependent at the start values."""
+MISFIT = 1.5
+"""Sum of squares over that of all candidates together above which the elimination was too strict."""
 OUTLIER_LEVEL = 1e-3
 """Probability that the largest of all poses is called an outlier by chance."""
 OUTLIER_SHARE = 0.15
@@ -268,7 +270,7 @@ class _Engine:
     ) -> None:
         self.evaluator, self.options, self.choice = evaluator, options, choice
         self.kernel, self.poses, self.stack = evaluator.kernel, evaluator.poses, evaluator.stack
-        self.scatter = 1.0
+        self.scatter, self.slack = 1.0, 1.0
         self._whitened: tuple[State, Array] | None = None
         self.priors = {self.kernel.index[name]: s for name, s in options.priors.items()}
 
@@ -298,15 +300,24 @@ class _Engine:
             self.scatter = self._scatter(state, names, weights)
             # What looks weak where it is linearised may matter further on: no look may make the fit worse than the
             # parameters that it saves are worth (Bayesian information criterion).
-            worth = 2.0 * summary.cost / self.scatter**2 + len(kept) * np.log(max(2, rows))
-            if best is not None and worth > best[0]:
+            worth = self._worth(summary.cost, len(kept), rows)
+            worse = best is not None and worth > best[0]
+            if best is None or not worse:
+                best = (worth, _Solution(problem, state, tuple(kept), eliminated, {}, first, summary, iterations))
+            strict = 2.0 * best[1].summary.cost / self.scatter**2 > MISFIT * rows
+            if round_ == 3 or (worse and not strict):
                 break
-            best = (worth, _Solution(problem, state, tuple(kept), eliminated, {}, first, summary, iterations))
-            if round_ == 3:
-                break
+            if strict and round_ > 0:  # something that matters was left out as weak: look again with more patience
+                self.slack *= 10.0
+                state = best[1].state
+                kept, eliminated = self._eliminate(state, names, weights)
+                continue
             # Deviations make some parameters visible that are dependent at nominal (parallel axes), and hide others.
             # Only the first look adds any; later ones only take away, so nothing can go round in circles.
             again, eliminated = self._eliminate(state, names if round_ == 0 else kept, weights, eliminated)
+            if again == kept and strict:
+                self.slack *= 10.0
+                again, eliminated = self._eliminate(state, names, weights)
             if again == kept:
                 best = (worth, replace(best[1], eliminated=eliminated))
                 break
@@ -345,6 +356,10 @@ class _Engine:
         else:
             final = self.solve(state, weights, (*forced, *taken))
             final = replace(final, eliminated={**gone, **final.eliminated})
+            if self._worth(final.summary.cost, len(final.names), rows) > self._worth(
+                solution.summary.cost, len(solution.names), rows
+            ):
+                final = solution
         iterations = solution.iterations + (final.iterations if final is not solution else 0)
         return replace(final, rejected=rejected, first=solution.first, iterations=iterations)
 
@@ -354,6 +369,10 @@ class _Engine:
         elastic = [k for n, k in zip(names, self.columns(names), strict=True) if ".elastic_" in n]
         theta[elastic] = 0.0
         return State(theta, state.world_T_base, state.flange_T_tool)
+
+    def _worth(self, cost: float, parameters: int, rows: int) -> float:
+        """Bayesian information criterion, in units of the data's own scatter; the smaller the better."""
+        return 2.0 * cost / self.scatter**2 + parameters * float(np.log(max(2, rows)))
 
     def _scatter(self, state: State, names: Sequence[str], weights: Array) -> float:
         """How far the stated covariance can be trusted: sigma0 of the data with all candidates free, one at least.
@@ -373,7 +392,8 @@ class _Engine:
         return max(1.0, float(np.sqrt(max(0.0, left) / max(1, rows - int(good.sum())))))
 
     def _limits(self, state: State, names: Sequence[str]) -> Array:
-        return plausible_limits(self.kernel.model, self.evaluator(state).moments, names) / self.scatter
+        limits = plausible_limits(self.kernel.model, self.evaluator(state).moments, names)
+        return limits * (self.slack / self.scatter)
 
     def _eliminate(
         self, state: State, names: Sequence[str], weights: Array, before: Mapping[str, Eliminated] | None = None

@@ -33,8 +33,8 @@ def test_exact_data_are_reproduced_to_rounding() -> None:
     exact = FrameObservations.isotropic(s.truth.frames(s.theta, s.poses), 5e-5, 1e-4)
     robot = identify(s.model, s.poses, [exact], kernel=s.kernel)
     assert robot.summary.converged
-    # parameters left at nominal (parallel axes) cost less than two micrometres
-    assert tool_miss(predict_frames(robot, s.kept_out)[0], s.truth.frames(s.theta, s.kept_out)) < 2e-6
+    # parameters left at nominal (parallel axes) cost less than a tenth of the stated noise
+    assert tool_miss(predict_frames(robot, s.kept_out)[0], s.truth.frames(s.theta, s.kept_out)) < 5e-6
 
 
 @pytest.mark.parametrize("compliant", [False, True])
