@@ -15,6 +15,7 @@ import casadi as ca
 import numpy as np
 
 from robcal.errors import InvalidInput
+from robcal.robot import c_inverse_templates as ci
 from robcal.robot import c_templates as c
 from robcal.robot.c_expressions import array, function_body, number
 from robcal.robot.chain import Chain, chain_of
@@ -158,7 +159,7 @@ def _inverse_parts(chain: Chain) -> list[str]:
     parts.append(f"#define LARGEST_STEP {number(LARGEST_STEP)}\n#define FLIP {number(FLIP)}")
     if chain.n_joints < 6:
         parts.append(f"#define TILT_TOLERANCE {number(settings.tilt_tolerance)}")
-    parts.append(c.NUMERIC)
+    parts.append(ci.NUMERIC)
     arm, first = carried_arm(chain)
     structure: Structure = find_structure(arm) if arm is not None else None
     if arm is None or structure is None:
@@ -166,7 +167,7 @@ def _inverse_parts(chain: Chain) -> list[str]:
         table = ",\n    ".join(array(s) for s in starts)
         start_table = f"static const double START[STARTS][N] = {{\n    {table}}};"
         parts += ["#define HELD 0", f"#define STARTS {len(starts)}", start_table]
-        return [*parts, c.NUMERIC_INVERSE]
+        return [*parts, ci.NUMERIC_INVERSE]
     probe = perpendicular(arm.axes[5] if isinstance(structure, SphericalWrist) else arm.axes[1])
     parts += [
         f"#define FIRST {first}",
@@ -174,15 +175,15 @@ def _inverse_parts(chain: Chain) -> list[str]:
         f"static const double HOME_INVERSE[12] = {array(invert(chain.home)[:3].ravel())};",
         f"static const double CENTRE[3] = {array(structure.centre)};",
         f"static const double PROBE[3] = {array(probe)};",
-        c.SUBPROBLEMS,
+        ci.SUBPROBLEMS,
     ]
     if isinstance(structure, SphericalWrist):
         if structure.shoulder is not None:
             parts.append(f"static const double SHOULDER[3] = {array(structure.shoulder)};")
         if structure.arm != "meeting_12":
-            parts.append(c.TO_PLANE)
-        arms = {"parallel_23": c.ARM_PARALLEL_23, "meeting_12": c.ARM_MEETING_12, "parallel_12": c.ARM_PARALLEL_12}
-        parts += [c.TWO_TURNS, arms[structure.arm], c.SPHERICAL_WRIST]
+            parts.append(ci.TO_PLANE)
+        arms = {"parallel_23": ci.ARM_PARALLEL_23, "meeting_12": ci.ARM_MEETING_12, "parallel_12": ci.ARM_PARALLEL_12}
+        parts += [ci.TWO_TURNS, arms[structure.arm], ci.SPHERICAL_WRIST]
     else:
-        parts += [c.TO_PLANE, c.PARALLEL_ARM]
-    return [*parts, c.CLOSED_INVERSE]
+        parts += [ci.TO_PLANE, ci.PARALLEL_ARM]
+    return [*parts, ci.CLOSED_INVERSE]

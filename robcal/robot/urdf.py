@@ -10,10 +10,7 @@ are neither read nor written: with a template its visual and collision elements 
 
 from __future__ import annotations
 
-import io
 import math
-import re
-from dataclasses import dataclass
 from typing import Any
 from xml.etree import ElementTree
 
@@ -21,24 +18,11 @@ import numpy as np
 
 from robcal.errors import InvalidInput
 from robcal.robot.model import Frame, RobotModel
+from robcal.robot.urdf_chain import UrdfStep, chain_steps, parse_urdf
 from robcal.transforms import Array, frame, frame_from_xyzrpy, invert, rotation_from_rpy, rpy_from_rotation
 
 _ALIGNED = 1e-9
 _FIXED_NAMES = {"base": "base_mount", "tool": "tool_mount", "gravity": "gravity_mount", "payload": "payload_mount"}
-
-
-@dataclass(frozen=True)
-class _Step:
-    """A joint on the way to the tip, as URDF has it."""
-
-    name: str
-    kind: str
-    origin: Array
-    axis: Array
-    limits: tuple[float, float] | None
-    mass: float
-    cog: Array
-    child: str
 
 
 def model_from_urdf(text: str, base: str | None = None, tip: str | None = None) -> RobotModel:
@@ -51,8 +35,8 @@ def model_from_urdf(text: str, base: str | None = None, tip: str | None = None) 
     InvalidInput : no readable URDF, unknown links, several possible tips, or joints of another kind than revolute,
         continuous, prismatic and fixed.
     """
-    robot = _parse(text)
-    steps = _chain_steps(robot, base, tip)
+    robot = parse_urdf(text)
+    steps = chain_steps(robot, base, tip)
     if not any(s.kind != "fixed" for s in steps):
         raise InvalidInput(f"URDF '{robot.name}': the chain to '{steps[-1].child if steps else tip}' has no joint")
     frames: list[Frame] = []
@@ -114,7 +98,7 @@ def joint_axis_in_child(f: Frame) -> Array:
     return f.sign * np.where(np.abs(local) < 1e-15, 0.0, local)
 
 
-def _frames_of(step: _Step, G: Array, used: set[str]) -> tuple[list[Frame], Array]:
+def _frames_of(step: UrdfStep, G: Array, used: set[str]) -> tuple[list[Frame], Array]:
     """Frames for a joint whose URDF frame is G in the frame before, and the link as seen from the last of them."""
     R, name = G[:3, :3], _free_name(step.name, used)
     xyz, rpy = _triple(G[:3, 3]), rpy_from_rotation(R)
@@ -156,102 +140,6 @@ def _with_mass(f: Frame, mass: float, cog: Array) -> Frame:
         return f
     centre = (f.mass * np.array(f.cog) + mass * cog) / total
     return Frame(f.name, f.axis, f.prismatic, f.sign, f.limits, f.xyz, f.rpy, total, _triple(centre))
-
-
-def _yourdfpy() -> Any:
-    try:
-        import yourdfpy
-    except ImportError as error:
-        raise InvalidInput("reading and writing URDF needs the package yourdfpy: pip install robcal[urdf]") from error
-    return yourdfpy
-
-
-def _parse(text: str) -> Any:
-    yourdfpy = _yourdfpy()
-    # entities are how hostile XML grows; a robot description has no use for them
-    if re.search(r"<!(DOCTYPE|ENTITY)", text, re.IGNORECASE):
-        raise InvalidInput("the URDF declares a document type or entities, which is refused; remove them")
-    if "<robot" not in text:
-        raise InvalidInput("the file is no URDF: it has no <robot> element (a xacro file must be expanded first)")
-    try:
-        ElementTree.fromstring(text)
-    except ElementTree.ParseError as error:
-        raise InvalidInput(f"the URDF cannot be read, its XML is broken: {error}") from error
-    try:
-        urdf = yourdfpy.URDF.load(
-            io.BytesIO(text.encode()), load_meshes=False, load_collision_meshes=False, build_scene_graph=False,
-            build_collision_scene_graph=False,
-        )  # fmt: skip
-    except Exception as error:  # yourdfpy and lxml raise their own kinds without a common base
-        raise InvalidInput(f"the URDF cannot be read: {str(error)[:200]}") from error
-    return urdf.robot
-
-
-def _chain_steps(robot: Any, base: str | None, tip: str | None) -> list[_Step]:
-    masses = {link.name: _inertial(link) for link in robot.links}
-    parent_joint = {joint.child: joint for joint in robot.joints}
-    for link, what in ((base, "base"), (tip, "tip")):
-        if link is not None and link not in masses:
-            raise InvalidInput(f"URDF '{robot.name}' has no link '{link}' for {what}; it has {', '.join(masses)}")
-
-    def path(link: str) -> list[Any]:
-        joints: list[Any] = []
-        while link in parent_joint and link != base:
-            joint = parent_joint[link]
-            joints.append(joint)
-            link = joint.parent
-            if len(joints) > len(robot.joints):
-                raise InvalidInput(f"URDF '{robot.name}': the joints form a loop")
-        if base is not None and link != base:
-            return []
-        return joints[::-1]
-
-    if tip is None:
-        parents = {joint.parent for joint in robot.joints}
-        ends = [name for name in masses if name not in parents and path(name)]
-        moving = {name: sum(j.type != "fixed" for j in path(name)) for name in ends}
-        most = max(moving.values(), default=0)
-        best = [name for name in ends if moving[name] == most]
-        # several ends behind the same last joint (flange, tool0): the one with the longest name list is the farthest
-        best.sort(key=lambda name: len(path(name)))
-        movers = {tuple(j.name for j in path(name) if j.type != "fixed") for name in best}
-        if len(movers) > 1:
-            ends_found = ", ".join(sorted(best))
-            raise InvalidInput(f"URDF '{robot.name}' has several chains; name the tip, one of {ends_found}")
-        if not best:
-            raise InvalidInput(f"URDF '{robot.name}' has no joints")
-        tip = best[-1]
-    joints = path(tip)
-    if not joints:
-        raise InvalidInput(f"URDF '{robot.name}': no chain leads from '{base}' to '{tip}'")
-    return [_step(joint, masses.get(joint.child, (0.0, np.zeros(3)))) for joint in joints]
-
-
-def _step(joint: Any, inertial: tuple[float, Array]) -> _Step:
-    if joint.type not in ("revolute", "continuous", "prismatic", "fixed"):
-        raise InvalidInput(f"URDF joint '{joint.name}' is of type '{joint.type}'; only single-axis joints form a chain")
-    if getattr(joint, "mimic", None) is not None:
-        raise InvalidInput(f"URDF joint '{joint.name}' mimics another one; coupled joints are given as a term instead")
-    origin = np.eye(4) if joint.origin is None else np.asarray(joint.origin, dtype=float)
-    axis = np.array([1.0, 0.0, 0.0]) if joint.axis is None else np.asarray(joint.axis, dtype=float)
-    length = float(np.linalg.norm(axis))
-    if not np.all(np.isfinite(origin)) or not (length > 1e-9 or joint.type == "fixed"):
-        raise InvalidInput(f"URDF joint '{joint.name}': origin and axis must be finite, the axis not zero")
-    limits = None
-    if joint.type in ("revolute", "prismatic") and joint.limit is not None:
-        limits = (float(joint.limit.lower or 0.0), float(joint.limit.upper or 0.0))
-        if limits == (0.0, 0.0):
-            limits = None
-    mass, cog = inertial
-    axis = axis / max(length, 1e-9)
-    return _Step(str(joint.name), str(joint.type), origin, axis, limits, mass, cog, str(joint.child))
-
-
-def _inertial(link: Any) -> tuple[float, Array]:
-    if link.inertial is None or link.inertial.mass is None:
-        return 0.0, np.zeros(3)
-    origin = np.eye(4) if link.inertial.origin is None else np.asarray(link.inertial.origin, dtype=float)
-    return float(link.inertial.mass), origin[:3, 3]
 
 
 def _free_name(name: str, used: set[str]) -> str:
@@ -303,8 +191,8 @@ def _plain(model: RobotModel) -> str:
 
 
 def _from_template(model: RobotModel, template: str) -> str:
-    robot = _parse(template)
-    steps = [s for s in _chain_steps(robot, None, None) if s.kind != "fixed"]
+    robot = parse_urdf(template)
+    steps = [s for s in chain_steps(robot, None, None) if s.kind != "fixed"]
     nominal = model_from_urdf(template)
     if [f.name for f in nominal.joints] != [f.name for f in model.joints] or len(nominal.frames) != len(model.frames):
         raise InvalidInput(
@@ -333,7 +221,7 @@ def _from_template(model: RobotModel, template: str) -> str:
     return '<?xml version="1.0"?>\n' + ElementTree.tostring(root, encoding="unicode") + "\n"
 
 
-def _link_T_frame(step: _Step, before: Frame) -> Array:
+def _link_T_frame(step: UrdfStep, before: Frame) -> Array:
     """How the project's frame of a joint is turned against URDF's child link (identity for direct joints)."""
     direct = joint_axis_in_child(before)
     if np.linalg.norm(direct - step.axis) < 1e-6:
