@@ -10,7 +10,7 @@ import numpy as np
 from robcal.diagnosis.recording import Fit, Recording, observation_data
 from robcal.diagnosis.scan import Entry
 from robcal.physics.family import Array, Constants, Family, ObservationData
-from robcal.robot.terms import evaluate
+from robcal.robot.terms import evaluate, names_in
 
 
 @dataclass(frozen=True)
@@ -42,9 +42,23 @@ class Tangents:
         out = np.zeros((len(self.row_pose), len(names)))
         if family.bases is not None:
             for basis in family.bases(constants):
-                law = np.broadcast_to(evaluate(basis.expression, self.variables), self.variables["index"].shape)
+                law = self._law(basis.expression)
                 out[:, names.index(basis.parameter)] += self.motion[basis.frame, basis.kind] * law[self.row_pose]
         return out
+
+
+    def _law(self, expression: str) -> Array:
+        """Value (n,) of an expression; what does not depend on moments is kept for later fits of the recording."""
+        known = self.recording.laws.get(expression)
+        if known is None:
+            known = np.broadcast_to(evaluate(expression, self.variables), self.variables["index"].shape)
+            if all(name in self.recording.covariates or name in self._joints for name in names_in(expression)):
+                self.recording.laws[expression] = known
+        return known
+
+    @property
+    def _joints(self) -> frozenset[str]:
+        return frozenset(f"q{k + 1}" for k in range(self.recording.q.shape[1]))
 
 
 def tangents(fit: Fit, recording: Recording) -> Tangents:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -65,6 +66,11 @@ class Recording:
         plain = rows if self.shared is None else self.shared.unwhiten(rows)
         L = np.linalg.cholesky(self.observations.noise(frames))
         return np.asarray(L @ plain.reshape(len(L), -1, rows.shape[1]))
+
+    @cached_property
+    def laws(self) -> dict[str, Array]:
+        """Values (n,) of expressions already evaluated that depend on the recording alone, not on the model."""
+        return {}
 
     def pose_name(self, index: float) -> str:
         """Name of the pose with a value of the covariate `index`."""
