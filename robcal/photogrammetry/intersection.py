@@ -99,7 +99,7 @@ def intersect(
         d_ext = d_point @ np.concatenate([np.broadcast_to(-np.eye(3), (len(xy), 3, 3)), skew(p_camera)], axis=-1)
         d_world = d_point @ np.swapaxes(T[:, :3, :3], -1, -2)
         mask = used[:, None, None]
-        ok = np.isfinite(d_world).all(axis=(1, 2))[:, None, None] & mask
+        ok = np.asarray(np.isfinite(d_world).all(axis=(1, 2)))[:, None, None] & mask
         return (
             np.where(ok[..., 0], np.einsum("mij,mj->mi", W, r), 0.0),
             np.where(ok, W @ d_world, 0.0),

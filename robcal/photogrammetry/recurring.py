@@ -44,7 +44,7 @@ class RecurringPair:
 class Recurring:
     """Recurring deviations of lengths.
 
-    ``pairs`` the significant ones, ``targets`` shifts that explain them, ``scale_ppm`` with ``scale_sigma_ppm`` a common
+    ``pairs`` the significant ones, ``targets`` shifts that explain them, ``scale_ppm`` (``scale_sigma_ppm``) a common
     scale of all measured lengths (measured = true * (1 + ppm); None when not significant), ``unexplained`` significant
     pairs that neither explains, ``mean_points`` (t, 3) body coordinates as measured (NaN where too few poses).
     """

@@ -87,7 +87,7 @@ def orient_station(
     exterior, fixed, contradicting = connect_cameras(names, images, stated)
     bad = set(contradicting)
     rejected = [
-        RejectedMark(names[c], p, -1, "image contradicts the other cameras: another pose or a slipped image", "contradiction")
+        RejectedMark(names[c], p, -1, "image contradicts the other cameras: another pose shown?", "contradiction")
         for c, p in sorted(bad)
     ]
     rejected += [RejectedMark(names[c], p, -1, reason, "no_pose") for c, p, reason in failed]

@@ -122,7 +122,8 @@ def _worst_target(state: StationState, adjusted: Adjusted) -> Evidence | None:
     if scan.statistic[i] < _TARGET_LIMIT * max(1.0, scan.rest[i] / float(stats.chi2.median(3))):
         return None
     ident = int(state.body.ids[i])
-    text = f"target {ident} of body {state.body.name} is {1e3 * np.linalg.norm(scan.error[i]):.3g} mm from where its file says"
+    size = 1e3 * np.linalg.norm(scan.error[i])
+    text = f"target {ident} of body {state.body.name} is {size:.3g} mm from where its file says"
     return Evidence(
         "target_shifted", str(ident), None, scan.error[i], scan.covariance[i], float(scan.statistic[i]), 3, text
     )

@@ -97,8 +97,8 @@ class StationSettings:
 class Evidence:
     """Something in the data that contradicts the model again and again, with its test.
 
-    ``kind``: 'camera_moved', 'target_shifted', 'target_swapped' (``where``: both ids), 'lens_radial', 'lens_tangential',
-    'lens_affinity'; ``where``: camera or target; ``pose``: first
+    ``kind``: 'camera_moved', 'target_shifted', 'target_swapped' (``where``: both ids), 'lens_radial',
+    'lens_tangential', 'lens_affinity'; ``where``: camera or target; ``pose``: first
     pose concerned or None; ``estimate`` and ``covariance`` in the units of the kind (shift m, turn rad in the camera's
     or the body's coordinates); ``statistic`` chi-square with ``degrees`` of freedom; ``statement`` a sentence.
     """

@@ -251,9 +251,10 @@ def _refuse_slipped(
             continue
         support = vote_relative([a[p] for p in common], [b[p + shift] for p in common])[1]
         if support.sum() > 0.7 * len(common):
+            when = "later" if shift > 0 else "earlier"
             raise InvalidInput(
                 f"the images of camera {second} are slipped by {abs(shift)} against those of {first} (what "
-                f"{first} shows in a pose, {second} shows {abs(shift)} {'later' if shift > 0 else 'earlier'}; so they agree in "
+                f"{first} shows in a pose, {second} shows {abs(shift)} {when}; so they agree in "
                 f"{int((support > 0.1).sum())} of {len(common)} poses): rename them"
             )
     raise InvalidInput(

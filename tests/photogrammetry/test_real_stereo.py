@@ -36,7 +36,8 @@ def _load():
             np.tile(np.eye(2) * 0.1**2, (len(table), 1, 1)),
         )
         y = yaml.safe_load((DATA / f"{name}.yaml").read_text())
-        cameras[name] = Camera(*(y[k] for k in ("width", "height", "fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")))
+        numbers = ("width", "height", "fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+        cameras[name] = Camera(*(y[k] for k in numbers))
     return body, marks, cameras
 
 
