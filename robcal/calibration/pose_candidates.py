@@ -29,6 +29,9 @@ from robcal.robot.inverse import inverse_kinematics
 from robcal.robot.model import RobotModel
 from robcal.transforms import Array, exp_so3, frame, invert, transform
 
+HOPELESS = 60_000
+"""Without a single admissible configuration among so many, the search ends."""
+
 _BATCH = 4000
 
 
@@ -95,7 +98,7 @@ def find_candidates(
     tried = found = 0
     aimed = bool(cell.viewpoints) and chain.n_joints >= 6
     turn = 0
-    while found < count and tried < most:
+    while found < count and tried < (most if found else min(most, HOPELESS)):
         turn += 1
         if aimed and turn % 2 == 0:
             q, missed = _aimed(chain, cell, low, high, rng)
