@@ -102,17 +102,17 @@ def choose_candidates(model: RobotModel, parameters: str | Sequence[str]) -> Can
 
 
 def plausible_limits(model: RobotModel, moments: Array, names: Sequence[str]) -> Array:
-    """Standard deviation (p,) above which a parameter is not worth identifying; infinite for terms and loads.
+    """Standard deviation (p,) above which a parameter is not worth identifying; infinite for loads and terms without prior.
 
     ``moments`` are the poses' moments (n, m) in the order of :func:`robcal.robot.statics.moment_names`.
     """
     largest = dict(zip(moment_names(model), np.abs(moments).max(axis=0, initial=0.0), strict=True))
     limits = np.full(len(names), np.inf)
     frames = {f.name for f in model.frames}
+    priors = {f"{t.name}.{short}": 2.0 * sigma for t in model.terms for short, sigma in t.priors.items()}
     for k, name in enumerate(names):
         frame, _, kind = name.rpartition(".")
-        if frame in ("base", "tool"):
-            limits[k] = PLAUSIBLE_START
+        limits[k] = priors.get(name, PLAUSIBLE_START if frame in ("base", "tool") else np.inf)
         if frame not in frames:
             continue
         if kind in ("x", "y", "z"):
