@@ -70,8 +70,9 @@ def _ideal_jacobian(camera: Camera, ideal: Array) -> Array:
 def body_normals(points: ArrayLike, neighbours: int = 6) -> Array:
     """Unit normals (t, 3) of targets on a body from the body's own shape; sign: away from the centroid where curved.
 
-    A plane gets its normal, a sphere radial ones, any other smooth body those of planes through the nearest
-    neighbours. NaN where the neighbourhood is no plane (thicker than a quarter of its width).
+    Where most targets lie on a plane or sphere, these and targets a little above it (a scale bar on a plate) get the
+    plane's normal or radial ones; all others those of planes through the nearest neighbours, or NaN where the
+    neighbourhood is no plane (thicker than a quarter of its width).
 
     Weakness: targets on small facets with few neighbours get NaN; then no eccentricity is modelled for them.
     """
@@ -80,30 +81,68 @@ def body_normals(points: ArrayLike, neighbours: int = 6) -> Array:
     normals = np.full((t, 3), np.nan)
     if t < 4:
         if t == 3:
-            normal = np.cross(p[1] - p[0], p[2] - p[0])
-            length = np.linalg.norm(normal)
+            across = np.cross(p[1] - p[0], p[2] - p[0])
+            length = np.linalg.norm(across)
             if length > 0:
-                normals[:] = normal / length
+                normals[:] = across / length
         return normals
     centred = p - p.mean(axis=0)
-    _, values, axes = np.linalg.svd(centred, full_matrices=False)
-    if values[2] < 0.02 * values[1]:
-        normals[:] = axes[2]
-        return normals
-    if t >= 8:
-        centre, radius, misfit = fit_sphere(p)
-        if misfit < 0.02 * radius:
-            return (p - centre) / np.linalg.norm(p - centre, axis=1, keepdims=True)
+    width = float(np.median(np.linalg.norm(p - np.median(p, axis=0), axis=1)))
+    shape = _dominant_shape(p, 0.02 * width)
+    done = np.zeros(t, dtype=bool)
+    if shape is not None:
+        centre, normal = shape
+        if normal is not None:
+            height = (p - centre) @ normal
+            done = np.abs(height) < 0.15 * width
+            normals[done] = normal
+        else:
+            away = p - centre
+            distance = np.linalg.norm(away, axis=1)
+            done = np.abs(distance / np.median(distance) - 1.0) < 0.05
+            normals[done] = away[done] / distance[done, None]
+        if done.all():
+            return normals
     count = min(neighbours, t - 1)
     distance = np.linalg.norm(p[:, None] - p[None], axis=2)
     nearest = np.argsort(distance, axis=1)[:, : count + 1]
     local = p[nearest] - p[nearest].mean(axis=1, keepdims=True)
     _, values, axes = np.linalg.svd(local, full_matrices=False)
-    flat = values[:, 2] < 0.25 * values[:, 1]
+    flat = (values[:, 2] < 0.25 * values[:, 1]) & ~done
     normals[flat] = axes[flat, 2]
-    outward = np.einsum("ti,ti->t", normals, centred) < 0
-    normals[outward] *= -1.0
+    inward = (np.einsum("ti,ti->t", normals, centred) < 0) & ~done
+    normals[inward] *= -1.0
     return normals
+
+
+def _dominant_shape(points: Array, tolerance: float) -> tuple[Array, Array | None] | None:
+    """(centre, normal) of a plane or (centre, None) of a sphere that holds 70 % of points (t, 3); None if neither."""
+    t = len(points)
+    needed = 0.7 * t
+    rng = np.random.default_rng(0)
+    triples = np.array([rng.choice(t, 3, replace=False) for _ in range(60)])
+    a, b, c = (points[triples[:, k]] for k in range(3))
+    normal = np.cross(b - a, c - a)
+    length = np.linalg.norm(normal, axis=1)
+    normal = normal[length > 0] / length[length > 0, None]
+    a = a[length > 0]
+    inside = np.abs(np.einsum("ki,tki->kt", normal, points[:, None] - a)) < tolerance
+    if len(inside) and inside.sum(axis=1).max() >= needed:
+        chosen = points[inside[np.argmax(inside.sum(axis=1))]]
+        centre = chosen.mean(axis=0)
+        return centre, np.linalg.svd(chosen - centre, full_matrices=False)[2][2]
+    if t < 8:
+        return None
+    chosen = points
+    for _ in range(4):
+        centre, radius, _ = fit_sphere(chosen)
+        miss = np.abs(np.linalg.norm(points - centre, axis=1) - radius)
+        close = miss < max(0.02 * radius, float(np.quantile(miss, 0.7)))
+        if np.count_nonzero(close) < 6:
+            return None
+        chosen = points[close]
+    held = np.count_nonzero(miss < 0.02 * radius)
+    return (centre, None) if held >= needed else None
 
 
 def fit_sphere(points: ArrayLike) -> tuple[Array, float, float]:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Literal
 
+import numpy as np
+
 from robcal.errors import InvalidInput
 from robcal.photogrammetry.camera import Camera
 from robcal.photogrammetry.colmap_engine import adjust_with_colmap
@@ -48,7 +50,8 @@ def survey_body(
             f"the images are {size[0]} x {size[1]} px but the camera file says {camera.width} x {camera.height}: "
             "give the calibration of this camera at this resolution, or none"
         )
-    work = Survey(collect(images, targets, bars), targets, size, camera, bars, checks, settings)
+    ends = np.concatenate([bars.ids.ravel(), checks.ids.ravel()])
+    work = Survey(collect(images, targets, ends), targets, size, camera, bars, checks, settings)
     work.check_scale(datum)
     network = work.first_adjustment()
     network = work.match(network)

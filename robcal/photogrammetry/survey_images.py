@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robcal.errors import DegenerateGeometry, InvalidInput
-from robcal.photogrammetry.network import ImageMarks, IntArray, Lengths
+from robcal.photogrammetry.network import ImageMarks, IntArray
 from robcal.photogrammetry.survey_matching import Sightings
 from robcal.transforms import Array
 
@@ -56,11 +56,11 @@ class Collection:
         return Sightings(image, self.xy[rows], sigma, self.semi_axes[rows, 0])
 
 
-def collect(images: Sequence[SurveyImage], targets: Sequence[BodyTarget], bars: Lengths) -> Collection:
+def collect(images: Sequence[SurveyImage], targets: Sequence[BodyTarget], lengths: IntArray) -> Collection:
     """Put all images into columns; images that cannot help are left out with their reason.
 
-    A code counts as identified if the body (or a scale bar) lists it, or if the body lists no coded target at all. A
-    code that appears twice in an image identifies neither.
+    A code counts as identified if the body lists it, or if it ends a known length (``lengths``: their ids), or if the
+    body lists no coded target at all. A code that appears twice in an image identifies neither.
 
     Raises
     ------
@@ -70,7 +70,7 @@ def collect(images: Sequence[SurveyImage], targets: Sequence[BodyTarget], bars: 
     _check_names(images, targets)
     listed = {t.id for t in targets if t.id is not None and t.code is not None}
     if listed:
-        listed |= {int(v) for v in bars.ids.ravel()}
+        listed |= {int(v) for v in np.ravel(lengths)}
     names: list[str] = []
     columns: list[tuple[Array, Array, Array, IntArray]] = []
     unused: list[tuple[str, str]] = []

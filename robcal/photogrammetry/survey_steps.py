@@ -439,7 +439,8 @@ class Survey:
             for i, p in zip(network.ids, network.points, strict=True)
             if int(i) in self.given
         ]
-        network = replace(network, rejected=tuple(dict.fromkeys(self.rejected)))
+        named = [replace(r, target=self._new_name.get(r.target, r.target)) for r in self.rejected]
+        network = replace(network, rejected=tuple(dict.fromkeys(named)))
         return SurveyResult(
             network=network,
             frame=frame,

@@ -57,6 +57,18 @@ def test_normals_of_plate_sphere_and_cylinder() -> None:
     assert np.isfinite(cosine).mean() > 0.9
 
 
+def test_a_bar_on_the_plate_does_not_bend_its_neighbours_normals() -> None:
+    rng = np.random.default_rng(4)
+    plate = plate_points(rng, 40)
+    bar = np.array([[-0.5, -0.45, 0.02], [0.5, -0.45, 0.02]])
+    far = np.array([[0.0, 0.0, 0.7]])
+    normals = body_normals(np.concatenate([plate, bar, far]))
+    np.testing.assert_allclose(np.abs(normals[:-1, 2]), 1.0, atol=2e-3)
+    sphere = sphere_points(rng, 40)
+    around = np.concatenate([sphere, [[0.5, 0.0, 0.0], [-0.5, 0.1, 0.0]]])
+    np.testing.assert_allclose(body_normals(around)[:40], sphere / 0.2, atol=1e-6)
+
+
 def test_shapeless_bodies_have_no_normals() -> None:
     cloud = np.random.default_rng(2).normal(size=(30, 3))
     assert np.isnan(body_normals(cloud)).any(axis=1).mean() > 0.7
