@@ -85,7 +85,8 @@ def fit_frames(
     if body.covariance is not None:
         t = len(body)
         H = np.moveaxis(sum_by(index * t + row, -K @ R, n * t).reshape(n, t, 6, 3), 1, 2).reshape(n, 6, 3 * t)
-        common += H @ body.covariance @ np.swapaxes(H, -1, -2)
+        # targets without coordinates have no covariance either and no part in any fit
+        common += H @ np.nan_to_num(body.covariance) @ np.swapaxes(H, -1, -2)
     count = np.bincount(index, minlength=n)
     targets = tuple(tuple(int(body.ids[row[k]]) for k in g) for g in groups)
     chi2 = sum_by(index, np.sum(r**2, axis=1), n)

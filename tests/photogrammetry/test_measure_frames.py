@@ -180,3 +180,14 @@ def test_plane_before_one_camera():
     assert len(f.pose) + len(f.rejected_poses) == 25
     turn = np.linalg.norm(difference(f.world_T_body, s.world_T_body[f.pose])[:, 3:], axis=1)
     assert turn.max() < 0.02  # never the mirrored pose
+
+
+def test_targets_without_coordinates_do_not_spoil_the_covariance():
+    _, points = _points()
+    t = len(PLATE) + 1
+    C = np.full((3 * t, 3 * t), np.nan)
+    C[:-3, :-3] = np.eye(3 * t - 3) * 1e-12
+    body = Body("plate", np.r_[BODY.ids, 99], np.r_[PLATE, np.full((1, 3), np.nan)], C)
+    f = measure_frames(points, body)
+    assert np.isfinite(f.common_covariance).all()
+    assert len(f.pose) == 40
