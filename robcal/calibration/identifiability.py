@@ -102,7 +102,9 @@ def choose_candidates(model: RobotModel, parameters: str | Sequence[str]) -> Can
 
 
 def plausible_limits(model: RobotModel, moments: Array, names: Sequence[str]) -> Array:
-    """Standard deviation (p,) above which a parameter is not worth identifying; infinite for loads and terms without prior.
+    """Standard deviation (p,) above which a parameter is not worth identifying; infinite for loads.
+
+    Terms: twice the prior, infinite without one.
 
     ``moments`` are the poses' moments (n, m) in the order of :func:`robcal.robot.statics.moment_names`.
     """
