@@ -78,6 +78,7 @@ def library(folder: Path, tables: Mapping[str, Path]) -> Answer:
     from pipeline.calibrated import recorded_inputs
     from pipeline.campaign import read_campaign
     from pipeline.runs import Run
+    from pipeline.stages.diagnose import own_elasticities
     from pipeline.stages.identify import identify_recording, options_of, require_robot
     from pipeline.stages.observations import build_recording
     from robcal.diagnosis.contract import as_contract
@@ -116,7 +117,11 @@ def library(folder: Path, tables: Mapping[str, Path]) -> Answer:
     if identify is None:
         raise RuntimeError("no poses to identify from")
     result = diagnose(
-        found.model, identify, found.names, tuple(found.eliminated), recording(np.flatnonzero(poses.verify))
+        found.model,
+        identify,
+        found.names,
+        (*found.eliminated, *own_elasticities(found)),
+        recording(np.flatnonzero(poses.verify)),
     )
     seconds = time.perf_counter() - start
     return Answer(as_contract(result), _predicted(result.model, campaign, covariates, tables), seconds)

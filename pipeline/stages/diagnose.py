@@ -11,6 +11,7 @@ import numpy as np
 from pipeline.bodies import body_for_robot
 from pipeline.calibrated import Calibrated
 from pipeline.campaign import Campaign
+from pipeline.common_errors import common_errors
 from pipeline.image_findings import images_of
 from pipeline.poses_table import Poses
 from pipeline.runs import write_json
@@ -18,19 +19,22 @@ from pipeline.stages.base import Context, Outcome, Stage, no_files
 from pipeline.stages.identify import load_identification, require_robot
 from pipeline.stages.observations import RobotRecording, Rows
 from pipeline.tables import write_table
+from robcal.calibration.identification import IdentifiedRobot
 from robcal.diagnosis.contract import as_contract, with_images
 from robcal.diagnosis.diagnose import diagnose
+from robcal.diagnosis.image_diagnosis import ImageFinding
 from robcal.diagnosis.recording import Accepted, Recording, fit
 from robcal.diagnosis.result import Diagnosis
 from robcal.diagnosis.selection import SelectionSettings
 from robcal.photogrammetry.bodies import Body
+from robcal.photogrammetry.measured_points import MeasuredPoints
 from robcal.transforms import Array
 
 NAME = "diagnose"
 
 
 def recording_for_diagnosis(
-    poses: Poses, recording: RobotRecording, rows: Rows, body: Body | None
+    poses: Poses, recording: RobotRecording, rows: Rows, body: Body | None, points: MeasuredPoints | None = None
 ) -> Recording | None:
     """The measurements of some poses in the form the diagnosis takes: the kind with the most of them."""
     chosen = recording.select(rows, detailed=True)
@@ -39,14 +43,16 @@ def recording_for_diagnosis(
     covariates = {name: np.asarray(values)[rows] for name, values in poses.covariates.items()}
     covariates.update({f"approach{k + 1}": poses.approach[rows, k] for k in range(poses.q.shape[1])})
     covariates["index"] = rows.astype(float)
+    observations = max(chosen, key=lambda o: len(o.pose) * o.dimension)
     return Recording(
         q=poses.q[rows],
         payload=tuple(poses.payload[i] for i in rows),
         covariates=covariates,
         names=tuple(poses.names[i] for i in rows),
-        observations=max(chosen, key=lambda o: len(o.pose) * o.dimension),
+        observations=observations,
         body=body.name if body is not None else "body",
         ids=tuple(int(i) for i in body.ids) if body is not None else (),
+        common=common_errors(observations, recording, rows, body, points),
     )
 
 
@@ -58,15 +64,17 @@ def work(context: Context) -> Outcome:
         content = with_images(None, images.findings, images.scans, images.noise)
         write_json(run.diagnosis, content)
         told = [str(finding.statement) for finding in images.findings] or [str(content["statement"])]
-        causes = [{"cause": f.cause, "where": f.where, "direction": f.direction} for f in images.findings]
-        result = {"mismatch": content["mismatch"], "p_value": content["p_value"], "causes": causes}
+        result = {
+            "mismatch": content["mismatch"], "p_value": content["p_value"], "causes": _named(images.findings),
+        }  # fmt: skip
         return Outcome({"diagnosis": result | {"heldout_px": content["heldout_px"]}}, [run.diagnosis], told)
     _, poses = require_robot(campaign)
     identification = load_identification(run)
+    points: MeasuredPoints | None = run.load("points") if run.has("points") else None
     found, measured = identification.robot(), identification.recording
     body = body_for_robot(campaign, run)
     used = np.array([row for row, use in zip(identification.rows, found.used, strict=True) if use], dtype=np.int64)
-    recording = recording_for_diagnosis(poses, measured, used, body)
+    recording = recording_for_diagnosis(poses, measured, used, body, points)
     kept_out = np.array([i for i in measured.poses if poses.verify[i]], dtype=np.int64)
     verify = recording_for_diagnosis(poses, measured, kept_out, body) if len(kept_out) else None
     if recording is None:
@@ -75,7 +83,7 @@ def work(context: Context) -> Outcome:
         found.model,
         recording,
         found.names,
-        tuple(found.eliminated),
+        (*found.eliminated, *own_elasticities(found)),
         verify,
         settings_of(campaign),
         context.messages.info,
@@ -98,9 +106,22 @@ def work(context: Context) -> Outcome:
             diagnosed=True,
         )
     outputs.append(run.save(f"calibrated_{NAME}", calibrated))
-    told = [*images.findings, *diagnosis.findings]
-    notes = [finding.statement for finding in told] or ["nothing missing: the model explains the data"]
-    return Outcome({"diagnosis": _result(diagnosis)}, outputs, notes)
+    told = [f.statement for f in images.findings] + [f.statement for f in diagnosis.findings]
+    notes = told or ["nothing missing: the model explains the data"]
+    result = _result(diagnosis) | {"mismatch": content["mismatch"]}
+    result["causes"] = _named(images.findings) + list(result["causes"])
+    return Outcome({"diagnosis": result}, outputs, notes)
+
+
+def own_elasticities(found: IdentifiedRobot) -> tuple[str, ...]:
+    """Elasticities about joints' own axes that the identification left out for want of evidence.
+
+    They belong to the standard model, so they are no missing physics; the diagnosis frees them with the first cause.
+    """
+    if found.options.parameters != "standard":
+        return ()
+    own = {f"{joint.name}.elastic_{joint.joint_kind}" for joint in found.model.joints if not joint.prismatic}
+    return tuple(name for name in found.rejected_elasticities if name in own)
 
 
 def settings_of(campaign: Campaign) -> SelectionSettings:
@@ -125,6 +146,10 @@ def _columns(rows: Any) -> dict[str, list[object]]:
     for row in rows:
         names.update(dict.fromkeys(row))
     return {name: [row.get(name, "") for row in rows] for name in names}
+
+
+def _named(findings: Sequence[ImageFinding]) -> list[dict[str, Any]]:
+    return [{"cause": f.cause, "where": f.where, "direction": f.direction} for f in findings]
 
 
 def _result(diagnosis: Diagnosis) -> dict[str, Any]:

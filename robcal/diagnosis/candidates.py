@@ -46,7 +46,6 @@ class Tangents:
                 out[:, names.index(basis.parameter)] += self.motion[basis.frame, basis.kind] * law[self.row_pose]
         return out
 
-
     def _law(self, expression: str) -> Array:
         """Value (n,) of an expression; what does not depend on moments is kept for later fits of the recording."""
         known = self.recording.laws.get(expression)

@@ -57,3 +57,29 @@ class SharedNoise:
     def subset(self, keep: Array) -> SharedNoise:
         """Only the observations of the given indices."""
         return SharedNoise(self.pose[keep], self.moved[keep], self.ratio)
+
+
+@dataclass(frozen=True)
+class CommonNoise:
+    """Errors that all observations share: the station's orientation, the coordinates of the body.
+
+    `columns` (m, k) are the whitened displacements of all rows by one standard deviation of each common error.
+    The covariance of whitened rows is `1 + N N'`; its inverse root is a change along k directions only.
+    """
+
+    columns: Array
+
+    @cached_property
+    def _directions(self) -> tuple[Array, Array]:
+        U, s, _ = np.linalg.svd(self.columns, full_matrices=False)
+        return U, np.sqrt(1.0 + s**2)
+
+    def whiten(self, rows: Array) -> Array:
+        """Apply the inverse root of the covariance to rows (m, ...)."""
+        U, root = self._directions
+        return np.asarray(rows + (U * (1.0 / root - 1.0)) @ (U.T @ rows))
+
+    def unwhiten(self, rows: Array) -> Array:
+        """Inverse of :meth:`whiten`."""
+        U, root = self._directions
+        return np.asarray(rows + (U * (root - 1.0)) @ (U.T @ rows))

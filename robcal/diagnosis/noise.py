@@ -39,14 +39,17 @@ def estimate_noise(
     model: RobotModel, recording: Recording, free: Sequence[str], accepted: Sequence[Accepted] = ()
 ) -> Noise:
     """Estimate both components at the fit of the given model."""
-    present = fit(model, replace(recording, shared=None), free, accepted)
-    return restricted_likelihood(present, recording)
+    plain = replace(recording, shared=None, common=None)
+    present = fit(model, plain, free, accepted)
+    # errors common to all poses are projected out like parameters
+    nuisance = None if recording.common is None else plain.whiten(recording.common, present.frames)
+    return restricted_likelihood(present, plain, nuisance)
 
 
-def restricted_likelihood(present: Fit, recording: Recording) -> Noise:
+def restricted_likelihood(present: Fit, recording: Recording, nuisance: Array | None = None) -> Noise:
     """Maximise the restricted likelihood over the ratio of the components; the common factor follows in closed form.
 
-    `recording` must be whitened by its stated covariance alone.
+    `recording` must be whitened by its stated covariance alone; `nuisance` (m, k) are further columns to project out.
     """
     joints = present.kernel.joint_jacobian(present.theta, present.inputs)
     _, flat = recording.observations.linearise(present.frames, joints)
@@ -54,7 +57,8 @@ def restricted_likelihood(present: Fit, recording: Recording) -> Noise:
     per = len(flat) // observations
     moved = flat.reshape(observations, per, -1)
     residual = present.residual.reshape(observations, per)
-    jacobian = present.jacobian.reshape(observations, per, -1)
+    absorbed = present.jacobian if nuisance is None else np.column_stack([present.jacobian, nuisance])
+    jacobian = absorbed.reshape(observations, per, -1)
     order = np.argsort(recording.observations.pose, kind="stable")
     pose = recording.observations.pose[order]
     starts = np.flatnonzero(np.r_[True, pose[1:] != pose[:-1]])

@@ -14,7 +14,7 @@ from robcal.calibration.observations import (
     PointObservations,
     SensorPointObservations,
 )
-from robcal.diagnosis.decorrelation import SharedNoise
+from robcal.diagnosis.decorrelation import CommonNoise, SharedNoise
 from robcal.diagnosis.scan import orthonormal_basis
 from robcal.errors import InvalidInput
 from robcal.physics.family import Array, Constants, Family, ObservationData
@@ -37,6 +37,8 @@ class Recording:
     names : of the poses.
     observations : one kind of measurement; `pose` in it counts rows of q.
     body : name of the measuring body; ids : its targets.
+    shared : repeatability of the joints as estimated. common : (m_obs, 3, k) displacements of points by one standard
+        deviation of errors common to all poses (orientation of the station, coordinates of the body).
     """
 
     q: Array
@@ -47,25 +49,38 @@ class Recording:
     body: str = "body"
     ids: tuple[int, ...] = ()
     shared: SharedNoise | None = None
+    common: Array | None = None
 
     def linearise(self, frames: Array, J: Array) -> tuple[Array, Array]:
         """Whitened residuals (m,) and Jacobian (m, p) at modelled frames (n, 4, 4) with right twists (n, 6, p)."""
         residual, jacobian = self.observations.linearise(frames, J)
-        if self.shared is None:
+        if self.shared is None and self.common is None:
             return residual, jacobian
-        return self.shared.whiten(residual), self.shared.whiten(jacobian)
+        return self._decorrelate(residual), self._decorrelate(jacobian)
 
     def whiten(self, displacement: Array, frames: Array) -> Array:
         """Whitened rows (m, p) of displacements (m_obs, k, p) of the observations; frames (n, 4, 4) as modelled."""
         L = np.linalg.cholesky(self.observations.noise(frames))
-        rows = np.linalg.solve(L, displacement).reshape(-1, displacement.shape[2])
-        return rows if self.shared is None else self.shared.whiten(rows)
+        return self._decorrelate(np.linalg.solve(L, displacement).reshape(-1, displacement.shape[2]))
 
     def unwhiten(self, rows: Array, frames: Array) -> Array:
         """Displacements (m_obs, k, p) of whitened rows (m, p); inverse of :meth:`whiten`."""
-        plain = rows if self.shared is None else self.shared.unwhiten(rows)
+        plain = rows if self._common is None else self._common.unwhiten(rows)
+        plain = plain if self.shared is None else self.shared.unwhiten(plain)
         L = np.linalg.cholesky(self.observations.noise(frames))
         return np.asarray(L @ plain.reshape(len(L), -1, rows.shape[1]))
+
+    def _decorrelate(self, rows: Array) -> Array:
+        rows = rows if self.shared is None else self.shared.whiten(rows)
+        return rows if self._common is None else self._common.whiten(rows)
+
+    @cached_property
+    def _common(self) -> CommonNoise | None:
+        if self.common is None:
+            return None
+        L = np.linalg.cholesky(self.observations.noise(np.tile(np.eye(4), (len(self.q), 1, 1))))
+        columns = np.linalg.solve(L, self.common).reshape(-1, self.common.shape[2])
+        return CommonNoise(columns if self.shared is None else self.shared.whiten(columns))
 
     @cached_property
     def laws(self) -> dict[str, Array]:
@@ -94,14 +109,16 @@ class Recording:
         """Without the observations of the given indices."""
         keep = np.setdiff1d(np.arange(len(self.observations.pose)), drop)
         shared = None if self.shared is None else self.shared.subset(keep)
-        return replace(self, observations=_rows(self.observations, keep), shared=shared)
+        common = None if self.common is None else self.common[keep]
+        return replace(self, observations=_rows(self.observations, keep), shared=shared, common=common)
 
     def subset(self, keep: Array) -> Recording:
         """Only the poses where `keep` (n,) is true; observations of the others are left out."""
         rows = np.flatnonzero(keep)
         number = np.full(len(self.q), -1)
         number[rows] = np.arange(len(rows))
-        observations = _rows(self.observations, np.flatnonzero(keep[self.observations.pose]))
+        chosen = np.flatnonzero(keep[self.observations.pose])
+        observations = _rows(self.observations, chosen)
         observations = replace(observations, pose=number[observations.pose])
         return replace(
             self,
@@ -111,6 +128,7 @@ class Recording:
             covariates={name: np.asarray(values)[rows] for name, values in self.covariates.items()},
             observations=observations,
             shared=None,
+            common=None if self.common is None else self.common[chosen],
         )
 
 

@@ -258,7 +258,8 @@ def _wire() -> Iterator[Family]:
         "radius_mm",
         1e3,
         "The wire wraps around a pulley of {radius_mm:.1f} mm radius that the model leaves out",
-        lambda d: np.arctan2(d.p_world[:, 2], np.hypot(d.p_world[:, 0], d.p_world[:, 1])),
+        # over the top of the pulley: the higher the wire leaves, the less of it is wrapped
+        lambda d: -np.arctan2(d.p_world[:, 2], np.hypot(d.p_world[:, 0], d.p_world[:, 1])),
     )
 
 
@@ -274,7 +275,8 @@ def _sensor(data: ObservationData, body: str) -> Iterator[Family]:
         (1e-3,),
         lambda v, c: {"ppm": float(v[0]) * 1e6},
         "The sensor measures {ppm:.0f} ppm too long",
-        displace=lambda d, c: np.einsum("mij,mj->mi", d.world_T_tool[:, :3, :3], _required(d.p_sensor))[:, :, None],
+        # residuals are p_world - T p_sensor: a longer measurement makes them shorter
+        displace=lambda d, c: -np.einsum("mij,mj->mi", d.world_T_tool[:, :3, :3], _required(d.p_sensor))[:, :, None],
     )
     yield Family(
         "sensor_rotation",

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipeline.stages.diagnose import own_elasticities
 from robcal.diagnosis.contract import as_contract
 from robcal.diagnosis.diagnose import diagnose
 from robcal.diagnosis.result import Diagnosis
@@ -16,7 +17,7 @@ from tests.diagnosis.recordings import concealed
 
 def run(folder: Path, seed: int, *effects: str, **plan: object) -> tuple[Diagnosis, object]:
     found, identify, verify, truth = concealed(folder, seed=seed, effects=list(effects), **plan)
-    return diagnose(found.model, identify, found.names, tuple(found.eliminated), verify), truth
+    return diagnose(found.model, identify, found.names, (*found.eliminated, *own_elasticities(found)), verify), truth
 
 
 def test_nothing_missing(tmp_path: Path) -> None:
@@ -71,8 +72,8 @@ def test_contract_is_plain_json(tmp_path: Path) -> None:
 
 
 def test_extended_model_predicts_better_where_nobody_measured(tmp_path: Path) -> None:
-    found, identify, verify, truth = concealed(tmp_path, seed=104, effects=["gear_ripple"], snr=20.0)
-    diagnosis = diagnose(found.model, identify, found.names, tuple(found.eliminated), verify)
+    found, identify, verify, _ = concealed(tmp_path, seed=104, effects=["gear_ripple"], snr=20.0)
+    diagnosis = diagnose(found.model, identify, found.names, (*found.eliminated, *own_elasticities(found)), verify)
     assert len(diagnosis.model.terms) == 1
     assert diagnosis.heldout[0] > diagnosis.heldout[1]
     assert np.isfinite([v for t in diagnosis.model.terms for v in t.parameters.values()]).all()
