@@ -242,6 +242,8 @@ def poses(
 
         messages = Messages(quiet)
         answer.update(generate_poses(config, out))
+        for sentence in answer["warnings"]:
+            messages.warn(sentence)
         messages.info(f"{answer['poses']} poses in {out}")
 
 

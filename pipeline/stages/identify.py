@@ -73,14 +73,14 @@ def work(context: Context) -> Outcome:
     kernel = Kernel(robot, campaign.entry.model.statics)
     inputs = recorded_inputs(kernel, poses)
     options = options_of(campaign, recording.stated)
+    check_joint_log(robot, poses, inputs, recording, kernel)
     nominal = fit_nominal(robot, inputs.subset(rows), recording.select(rows))
-    warning = check_joint_log(robot, poses, inputs, recording, rows, nominal)
     found, recording = identify_recording(robot, inputs, recording, rows, options, kernel)
     calibrated = calibrated_robot(poses, inputs, found, nominal.model)
     facts = {f.name: getattr(found, f.name) for f in fields(found) if f.name != "kernel"}
     outputs = [run.save(NAME, Identification(rows, facts, recording)), run.save(f"calibrated_{NAME}", calibrated)]
     write_robot(run.robot, found.model, f"calibrated from campaign {campaign.name}, before the diagnosis")
-    notes = [*recording.notes, *([warning] if warning else []), *_notes(found, poses, rows)]
+    notes = [*recording.notes, *_notes(found, poses, rows)]
     return Outcome({"identification": _result(found, rows)}, outputs, notes)
 
 

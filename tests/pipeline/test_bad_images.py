@@ -133,7 +133,7 @@ def test_images_slipped_by_one_against_the_joint_log(image_campaign: Path, detec
         paths[0].unlink()
     told = refused(image_campaign, detected, until="identify")
     assert "do not belong together" in told
-    assert "slipped by one row" in told
+    assert "slipped" in told
 
 
 def test_body_of_fewer_than_three_targets(image_campaign: Path, detected: Path) -> None:

@@ -1,0 +1,91 @@
+"""Faults of the joint log are named, with the fit after mending as proof."""
+
+import math
+from pathlib import Path
+
+import pytest
+
+from pipeline.runner import run_campaign
+from robcal.errors import InvalidInput, NotIdentifiable, RobcalError
+from tests.pipeline.conftest import Rows, edit_rows, edit_yaml
+
+JOINTS = [f"q{k}_deg" for k in range(1, 7)]
+
+
+def radians(rows: Rows) -> None:
+    for row in rows:
+        row.update({name: str(math.radians(float(row[name]))) for name in JOINTS})
+
+
+def slipped(rows: Rows) -> None:
+    values = [[row[name] for name in JOINTS] for row in rows]
+    for row, value in zip(rows, [*values[1:], values[0]], strict=True):
+        row.update(zip(JOINTS, value, strict=True))
+
+
+def wrong_sign(rows: Rows) -> None:
+    for row in rows:
+        row["q5_deg"] = str(-float(row["q5_deg"]))
+
+
+def exchanged(rows: Rows) -> None:
+    for row in rows:
+        row["q4_deg"], row["q6_deg"] = row["q6_deg"], row["q4_deg"]
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        (radians, ["wrong unit", "write degrees"]),
+        (slipped, ["slipped by 1 row"]),
+        (wrong_sign, ["axis5", "wrong sign", "change 'sign'"]),
+        (exchanged, ["joints 4 and 6 are exchanged"]),
+    ],
+)
+def test_fault_is_named_with_proof(frame_campaign: Path, tmp_path: Path, fault, words: list[str]) -> None:
+    edit_rows(frame_campaign / "poses.csv", fault)
+    with pytest.raises(InvalidInput) as error:
+        run_campaign(frame_campaign, tmp_path / "run", until="identify")
+    told = str(error.value)
+    for word in ["poses.csv", "do not belong together", *words]:
+        assert word in told
+
+
+def test_a_sound_log_passes(frame_campaign: Path, tmp_path: Path) -> None:
+    done = run_campaign(frame_campaign, tmp_path / "run", until="identify")
+    assert done.ran == ("identify",)
+
+
+def test_metres_under_a_heading_of_millimetres(frame_campaign: Path, tmp_path: Path) -> None:
+    def metres(rows: Rows) -> None:
+        for row in rows:
+            row.update({n: str(float(row[n]) / 1000) for n in ("x_mm", "y_mm", "z_mm")})
+
+    edit_rows(frame_campaign / "frames.csv", metres)
+    with pytest.raises(InvalidInput, match="must be in millimetres"):
+        run_campaign(frame_campaign, tmp_path / "run", until="identify")
+
+
+def test_fewer_poses_than_parameters(frame_campaign: Path, tmp_path: Path) -> None:
+    edit_rows(frame_campaign / "poses.csv", lambda rows: rows[:4])
+    edit_rows(frame_campaign / "frames.csv", lambda rows: rows[:4])
+    with pytest.raises(NotIdentifiable, match="measure more poses or choose fewer parameters"):
+        run_campaign(frame_campaign, tmp_path / "run", until="identify")
+
+
+def test_all_poses_alike(frame_campaign: Path, tmp_path: Path) -> None:
+    def alike(rows: Rows) -> None:
+        for row in rows:
+            row.update({name: rows[0][name] for name in row if name not in ("pose", "set")})
+
+    for name in ("poses.csv", "frames.csv"):
+        edit_rows(frame_campaign / name, alike)
+    with pytest.raises(RobcalError) as error:
+        run_campaign(frame_campaign, tmp_path / "run", until="identify")
+    assert "internal error" not in str(error.value)
+
+
+def test_unknown_parameter_name(frame_campaign: Path, tmp_path: Path) -> None:
+    edit_yaml(frame_campaign / "campaign.yaml", lambda d: d.update(model={"parameters": ["axis2.pich"]}))
+    with pytest.raises(InvalidInput, match=r"axis2\.pich"):
+        run_campaign(frame_campaign, tmp_path / "run", until="identify")
