@@ -319,3 +319,26 @@ def _fit_point(
             return X, sigma**2 * np.linalg.inv(A), rows
         rows = np.delete(rows, int(np.argmax(miss)))
     return None
+
+
+def seen_diameters(geometry: Geometry, points: Array, image: IntArray, semi_major: Array) -> Array:
+    """Diameters (q,) m of dots from their semi-major axes (q,) px, at points (3,) or (q, 3); NaN where unknown.
+
+    The major axis of a circle's image is not foreshortened (to first order of its size).
+    """
+    T = geometry.camera_T_body[image]
+    depth = np.einsum("qi,qi->q", T[:, 2, :3], np.broadcast_to(points, (len(image), 3))) + T[:, 2, 3]
+    return 2.0 * semi_major * depth / geometry.camera.fx
+
+
+def is_dot(diameters: Array, sizes: Array) -> bool:
+    """True if one dot seen with these diameters (q,) is of the same size everywhere and of a plausible one (k, 2).
+
+    Reflections and edges change their size from picture to picture. Where sizes are unknown nothing is refused.
+    """
+    known = diameters[np.isfinite(diameters)]
+    if len(known) < 2 or len(sizes) == 0:
+        return True
+    middle = float(np.median(known))
+    spread = 1.4826 * float(np.median(np.abs(known - middle)))
+    return spread < 0.15 * middle and bool(np.any((sizes[:, 0] < middle) & (middle < sizes[:, 1])))

@@ -18,7 +18,7 @@ from robcal.photogrammetry.start_network import StartNetwork, approximate_networ
 from robcal.photogrammetry.survey_frame import Similarity, body_frame, fit_similarity
 from robcal.photogrammetry.survey_images import Collection
 from robcal.photogrammetry.survey_late import place_late
-from robcal.photogrammetry.survey_matching import Geometry, find_new_points, match_known
+from robcal.photogrammetry.survey_matching import Geometry, find_new_points, is_dot, match_known, seen_diameters
 from robcal.photogrammetry.survey_types import BodyTarget, SurveyResult, SurveySettings
 from robcal.transforms import Array
 
@@ -356,13 +356,41 @@ class Survey:
             min_images=max(self.settings.min_images, min(4, len(network.image_names) // 3)),
         )
         pending = dict(self._pending)
+        geometry = Geometry.of(network)
+        sizes = self._plausible_sizes(geometry, rows, image, assigned)
         for point, members in zip(found.points, found.members, strict=True):
+            diameter = seen_diameters(geometry, point, image[members], self.data.semi_axes[rows[members], 0])
+            if not is_dot(diameter, sizes):
+                continue
             row = len(self.ids)
             self.ids.append(-1 - row)  # named at the end
             self.new_rows.add(row)
             self.data.assigned[rows[members]] = row
             pending[row] = point
         self._pending = pending
+
+    def _plausible_sizes(self, geometry: Geometry, rows: IntArray, image: IntArray, assigned: IntArray) -> Array:
+        """(q, 2) smallest and largest diameters in m (in the network's present scale) that a new dot may have.
+
+        Listed diameters of uncoded targets are believed to 30 %; without them a dot may be 0.4 to 2.5 times as large as
+        the known targets.
+        """
+        mine = np.flatnonzero((assigned >= 0) & (assigned < len(geometry.points)))
+        if len(mine) == 0:
+            return np.zeros((0, 2))
+        points = geometry.points[assigned[mine]]
+        seen = seen_diameters(geometry, points, image[mine], self.data.semi_axes[rows[mine], 0])
+        usual = float(np.nanmedian(seen)) if np.isfinite(seen).any() else np.nan
+        if not np.isfinite(usual):
+            return np.zeros((0, 2))
+        blank = [t for t in self.targets if t.code is None and t.xyz is None]
+        listed = {t.diameter for t in blank if t.diameter}
+        known = [self.diameter.get(self.ids[self.data.assigned[rows[r]]]) for r in mine]
+        stated = np.array([np.nan if d is None else d for d in known])
+        if listed and all(t.diameter for t in blank) and np.isfinite(stated).any():
+            scale = float(np.nanmedian(seen / stated))
+            return np.array([[0.7 * scale * d, 1.3 * scale * d] for d in sorted(listed)])
+        return np.array([[0.4 * usual, 2.5 * usual]])
 
     def finish(self, network: CameraNetwork, datum: str | tuple[int, ...]) -> tuple[CameraNetwork, str, str]:
         """Scale, frame and names; the last adjustment gives the covariances in the final datum."""

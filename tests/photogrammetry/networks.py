@@ -124,10 +124,13 @@ def detections(
         extra = rng.uniform([20, 20], [truth.camera.width - 20, truth.camera.height - 20], (clutter, 2))
         xy = np.concatenate([marks.xy[rows], extra])
         m = len(xy)
+        depth = transform(truth.camera_T_body[j], truth.points[marks.target[rows]])[:, 2]
+        major = 0.5 * (truth.diameter or 0.008) * truth.camera.fx / depth
+        axes = np.concatenate([major, rng.uniform(2.0, 20.0, clutter)])
         found = SimpleNamespace(
             xy=xy,
             covariance=np.tile(np.eye(2) * truth.sigma**2, (m, 1, 1)),
-            semi_axes=np.full((m, 2), 8.0),
+            semi_axes=np.column_stack([axes, 0.9 * axes]),
             code=np.concatenate([code, np.full(clutter, -1)]).astype(np.int64),
             message="",
         )
