@@ -21,7 +21,7 @@ from robcal.calibration.verification import fit_nominal, verify
 from robcal.robot.kernel import Kernel
 from robcal.robot.model import Frame, RobotModel, Term
 
-WAVE_PRIOR = 2e-4
+WAVE_PRIOR = 5e-4
 DEFAULT_SIGMA, DEFAULT_SIGMA_ANGLE = 2e-5, np.deg2rad(0.005)
 
 
