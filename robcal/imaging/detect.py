@@ -125,8 +125,7 @@ def saturation_level(image: NDArray) -> float:
     if high == top:
         return float(top)
     plateau = int(np.count_nonzero(image == high))
-    reach = max(1, (top + 1) >> 8)
-    below = int(np.count_nonzero(image >= max(high - 4 * reach, 0))) - plateau
+    below = int(np.count_nonzero(image >= high - max(1, high >> 6))) - plateau
     # free grey values thin out towards their maximum; a pile at the very maximum is a cut
     return float(high) if plateau >= 30 and plateau > 2 * below else float("inf")
 

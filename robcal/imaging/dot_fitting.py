@@ -143,12 +143,14 @@ def _first_round(
     groups = gather_windows(image, candidates, saturation)
     kept_groups, kept_fits = [], []
     for window in groups:
-        fit = iterate(_start(candidates, window), window, noise, 5, tolerance=0.2)
+        fit = iterate(_start(candidates, window), window, noise, 4, tolerance=0.2)
         used = np.maximum((fit.weight > 0).sum(axis=1), 1)
         mean_square = np.where(fit.weight > 0, fit.residual**2, 0.0).sum(axis=1) / used
         expected = np.where(fit.weight > 0, 1.0 / np.maximum(fit.weight, 1e-30), 0.0).sum(axis=1) / used
         contrast = np.abs(fit.parameters[:, 9])
-        near = np.flatnonzero(mean_square - 2.0 * expected < (3.0 * max_misfit * contrast) ** 2)
+        near = np.flatnonzero(
+            (window.radius < 2.0) | (mean_square - 2.0 * expected < (3.0 * max_misfit * contrast) ** 2)
+        )
         if near.size:
             window, fit = window.take(near), fit.take(near)
             kept_groups.append(window)

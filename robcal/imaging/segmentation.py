@@ -352,4 +352,7 @@ def step_all_around(image: NDArray, candidates: Candidates) -> NDArray[np.bool_]
     step = inner - outer
     typical = np.median(step, axis=1)
     low = np.sort(step, axis=1)[:, 3]
+    # in blobs of two pixels the nearest pixel stands for too much
+    tiny = candidates.semi_axes[:, 1] < 1.5
+    low = np.where(tiny, typical, low)
     return (typical > 0) & (low > 0.15 * typical) & (np.median(np.abs(step - typical[:, None]), axis=1) < 0.35 * typical)

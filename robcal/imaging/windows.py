@@ -12,8 +12,8 @@ from robcal.imaging.segmentation import Candidates
 
 Array = NDArray[np.float64]
 
-_PIXELS_PER_GROUP = 400_000  # bounds the memory of a group's Jacobian to some 40 MB
-_INSIDE_MAX = 450  # pixels kept of the even inside; the centre is in the edge
+_PIXELS_PER_GROUP = 25_000  # a group's Jacobian of some 2 MB stays in the processor's cache
+_EVEN_MAX = 250  # pixels kept of the even inside, and of the background; the centre is in the edge
 
 
 @dataclass(frozen=True)
@@ -112,12 +112,11 @@ def _gather(
         base, peak = candidates.base[chosen][:, None, None], candidates.peak[chosen][:, None, None]
         other = (values > base + 0.2 * (peak - base)) & (distance > 2.0 * blur + 0.7)
         valid &= ~_dilate(other)
-    inside = distance < -(3.0 * blur + 0.5)
-    # every k-th pixel of a large inside, in a pattern without direction
-    count = inside.sum(axis=(1, 2))
-    keep_every = np.maximum(1, np.ceil(count / _INSIDE_MAX)).astype(int)[:, None, None]
-    pattern = (2 * rows[:, :, None] + 3 * columns[:, None, :]) % keep_every == 0
-    valid &= ~inside | pattern
+    inside = distance < -(2.5 * blur + 0.5)
+    # every k-th row of a large inside or background: neighbours along rows stay, they tell of correlated noise
+    for even in (inside, valid & (distance > 2.5 * blur + 0.5)):
+        every = np.maximum(1, np.ceil(even.sum(axis=(1, 2)) / _EVEN_MAX)).astype(int)[:, None, None]
+        valid &= ~even | (rows[:, :, None] % every == 0)
     order = np.argsort(~valid.reshape(n, -1), axis=1, kind="stable")[:, : max(1, int(valid.sum(axis=(1, 2)).max()))]
 
     def flat(array: NDArray) -> NDArray:
