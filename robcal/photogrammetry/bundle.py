@@ -69,6 +69,7 @@ class _Work:
     group_sigma: Array
     names: tuple[str, ...]
     ids: IntArray
+    summaries: list[SolveSummary] = field(default_factory=list)
     rejected: list[RejectedMark] = field(default_factory=list)
 
     def subset(self) -> tuple[IntArray, IntArray]:
@@ -208,7 +209,7 @@ def adjust(
     return finish(
         problem,
         state,
-        summary,
+        _together([*work.summaries, summary]),
         free=tuple(free),
         left_out=tuple(left_out),
         image_names=tuple(names[i] for i in images),
@@ -218,6 +219,21 @@ def adjust(
         check_lengths=check_lengths,
         notes=tuple(notes),
         variance_components=settings.variance_components,
+    )
+
+
+def _together(runs: Sequence[SolveSummary]) -> SolveSummary:
+    """One summary of consecutive minimisations; whether it converged is up to the last one."""
+    last = runs[-1]
+    return SolveSummary(
+        last.converged,
+        sum(run.iterations for run in runs),
+        last.termination,
+        last.cost_start,
+        last.cost,
+        last.history,
+        sum(run.halvings for run in runs),
+        sum(run.seconds for run in runs),
     )
 
 
@@ -276,6 +292,7 @@ def _clean(
         state, summary = minimise(
             problem, state, robust=robust, max_iterations=settings.max_iterations, tolerance=tolerance
         )
+        work.summaries.append(summary)
         if summary.iterations and not np.isfinite(summary.cost):
             raise DegenerateGeometry(
                 "the start values put targets behind the camera: the images do not fit together, check ids and images"

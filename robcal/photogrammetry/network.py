@@ -194,6 +194,7 @@ class CameraNetwork:
     redundancy_total : observations minus unknowns plus datum defect.
     rejected : marks taken out; correlations : pairs of unknowns above 0.95.
     scale_bars, check_lengths : results per length; datum : what fixes the frame, in words.
+    summary : iterations and seconds of all minimisations together; costs and termination of the last one.
     """
 
     camera: Camera

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -14,6 +15,7 @@ from robcal.photogrammetry.network import Lengths
 from robcal.photogrammetry.survey_images import collect
 from robcal.photogrammetry.survey_steps import Survey
 from robcal.photogrammetry.survey_types import BodyTarget, SurveyImage, SurveyResult, SurveySettings
+from robcal.photogrammetry.survey_uncoded import identify_by_geometry, needs_geometry
 
 
 def survey_body(
@@ -50,6 +52,10 @@ def survey_body(
             f"the images are {size[0]} x {size[1]} px but the camera file says {camera.width} x {camera.height}: "
             "give the calibration of this camera at this resolution, or none"
         )
+    if needs_geometry(images, targets):
+        images = identify_by_geometry(images, targets, size, camera)
+        # now the ids stand for codes, whatever the body's file says
+        targets = [replace(t, code=t.code or "by geometry") if t.xyz is not None else t for t in targets]
     ends = np.concatenate([bars.ids.ravel(), checks.ids.ravel()])
     work = Survey(collect(images, targets, ends), targets, size, camera, bars, checks, settings)
     work.check_scale(datum)
