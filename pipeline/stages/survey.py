@@ -56,7 +56,8 @@ def survey_one(campaign: Campaign, run: Run, name: str, source: BodySource) -> S
         for t in source.file.targets
     ]
     listed = {t.id for t in targets}
-    stated = {number for length in [*entry.scale_bars, *entry.check_lengths] for number in length.targets}
+    pairs = [*(bar.targets for bar in entry.scale_bars), *(length.targets for length in entry.check_lengths)]
+    stated = {number for pair in pairs for number in pair}
     targets += [BodyTarget(number, "ring12") for number in sorted(stated - listed)]
     datum = tuple(entry.datum.fixed) if isinstance(entry.datum, FixedDatum) else entry.datum
     try:
