@@ -102,7 +102,7 @@ def find_markers(image: NDArray, dictionary: str, noise: NoiseModel) -> dict[str
 
 
 def _to_8_bit(image: NDArray) -> NDArray[np.uint8]:
-    return cv2.convertScaleAbs(image, alpha=255.0 / max(1, int(image.max())))
+    return (image * (255.0 / max(1, int(image.max())))).astype(np.uint8)
 
 
 def _corner_covariance(grey: NDArray[np.uint8], corners: Array, sigma2: float) -> Array:

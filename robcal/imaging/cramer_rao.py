@@ -43,9 +43,7 @@ def centre_bound(
     shape = np.concatenate([[phase], b, [[np.log(s)]]], axis=1)
     profile, by_shape = blurred_ellipse(shape, x.reshape(1, -1), y.reshape(1, -1))
     columns = by_shape[0] * contrast
-    if known_shape:
-        columns = columns[:, :2]
-    else:
-        columns = np.column_stack([columns, profile[0], np.ones(profile.shape[1])])
+    everything = np.column_stack([columns, profile[0], np.ones(profile.shape[1])])
+    columns = columns[:, :2] if known_shape else everything
     weight = 1.0 / noise.at(background + contrast * profile[0])
     return np.asarray(np.linalg.inv((columns * weight[:, None]).T @ columns)[:2, :2])

@@ -9,11 +9,13 @@ from numpy.typing import NDArray
 
 from robcal.errors import InvalidInput
 from robcal.imaging.aruco_markers import find_markers
+from robcal.imaging.blobs import step_all_around
 from robcal.imaging.detections import CodeState, Detections, Reason, RejectionLog, TargetKind, empty_columns
 from robcal.imaging.dot_fitting import FittedDots, blur_without_pixel, fit_dots, refit_coded
 from robcal.imaging.noise import NoiseModel, estimate_noise
 from robcal.imaging.ring_code import RingReadings, read_rings
-from robcal.imaging.segmentation import Candidates, find_candidates, step_all_around
+from robcal.imaging.segmentation import find_candidates
+from robcal.imaging.selection import accept, may_be_ring_parts, without_duplicates, without_ring_parts
 from robcal.imaging.settings import DetectionSettings
 
 Array = NDArray[np.float64]
@@ -51,20 +53,19 @@ def detect_targets(image: NDArray, settings: DetectionSettings = _DEFAULT) -> De
     saturation = _saturation(bright, settings)
     candidates = find_candidates(bright, bright_noise, settings, log)
     around = step_all_around(bright, candidates)
-    for row in np.flatnonzero(~around):
-        log.add(*candidates.xy[row], candidates.semi_axes[row, 0], Reason.SHAPE)
+    log.add_rows(candidates.xy[~around], candidates.semi_axes[~around, 0], Reason.SHAPE)
     candidates = candidates.take(around)
-    late = _may_be_ring_parts(candidates) if settings.ring12 else np.zeros(len(candidates), bool)
+    late = may_be_ring_parts(candidates) if settings.ring12 else np.zeros(len(candidates), bool)
     dots, bright_noise, _ = fit_dots(bright, candidates.take(~late), bright_noise, saturation, settings.max_misfit)
     log.count(Reason.SHAPE, int((~late).sum()) - len(dots))
-    dots = _accept(dots, bright, bright_noise, settings, log)
+    dots = accept(dots, bright, bright_noise, settings, log)
     readings, dots = _read(bright, dots, bright_noise, saturation, settings)
-    waiting = _without_ring_parts(candidates.take(late), dots, readings, log)
+    waiting = without_ring_parts(candidates.take(late), dots, readings, log)
     if len(waiting):
         more, _, _ = fit_dots(bright, waiting, bright_noise, saturation, settings.max_misfit)
-        more = _accept(more, bright, bright_noise, settings, log)
+        more = accept(more, bright, bright_noise, settings, log)
         dots, readings = _merged(bright, dots, readings, more, bright_noise, saturation, settings)
-    dots, readings = _without_duplicates(dots, readings, log)
+    dots, readings = without_duplicates(dots, readings, log)
     columns = _columns(dots, readings, settings, np.iinfo(image.dtype).max)
     if settings.aruco is not None:
         markers = find_markers(image, settings.aruco, noise)
@@ -130,65 +131,6 @@ def saturation_level(image: NDArray) -> float:
     return float(high) if plateau >= 30 and plateau > 2 * below else float("inf")
 
 
-def _may_be_ring_parts(candidates: Candidates) -> NDArray[np.bool_]:
-    """Blobs that lie wholly between 1.7 and 3.4 radii of a larger blob: fitted only if that is no coded dot."""
-    n = len(candidates)
-    result = np.zeros(n, bool)
-    if n < 2:
-        return result
-    area = np.prod(candidates.semi_axes, axis=1)
-    from scipy.spatial import cKDTree
-
-    tree = cKDTree(candidates.xy)
-    radius = 3.0 * candidates.semi_axes[:, 0]
-    for host, around in enumerate(tree.query_ball_point(candidates.xy, radius)):
-        others = np.array([k for k in around if k != host], dtype=int)
-        if others.size == 0:
-            continue
-        rho = _relative_radius(candidates.xy[others], candidates.xy[host], candidates.semi_axes[host], candidates.angle[host])
-        parts = (rho > 1.8) & (rho < 3.0) & (area[others] < 1.15 * area[host])
-        parts &= candidates.semi_axes[others, 1] < 0.85 * candidates.semi_axes[host, 0]
-        result[others[parts]] = True
-    return result
-
-
-def _relative_radius(xy: Array, centre: Array, semi_axes: Array, angle: float) -> Array:
-    """Distance from the centre of an ellipse in units of its radius."""
-    c, s = np.cos(angle), np.sin(angle)
-    d = xy - centre
-    return np.hypot((c * d[:, 0] + s * d[:, 1]) / semi_axes[0], (-s * d[:, 0] + c * d[:, 1]) / semi_axes[1])
-
-
-def _accept(
-    dots: FittedDots, image: NDArray, noise: NoiseModel, settings: DetectionSettings, log: RejectionLog
-) -> FittedDots:
-    """The fits that are dots; the others go to the log."""
-    n = len(dots)
-    if n == 0:
-        return dots
-    height, width = image.shape
-    sigma = np.sqrt(noise.at(dots.background))
-    reach = dots.semi_axes[:, 0] + 1.0
-    x, y = dots.xy.T
-    tests = (
-        (Reason.NO_CONVERGENCE, ~dots.converged | ~np.isfinite(dots.covariance).all(axis=(1, 2))),
-        (Reason.BORDER, (x < reach) | (y < reach) | (x > width - 1 - reach) | (y > height - 1 - reach)),
-        (Reason.CONTRAST, dots.contrast < settings.min_contrast_sigma * sigma),
-        (Reason.TOO_SMALL, ~dots.is_spot & (dots.semi_axes[:, 1] < settings.min_axis_px)),
-        (Reason.TOO_LARGE, dots.semi_axes[:, 0] > settings.max_axis_px),
-        (Reason.ELONGATED, dots.semi_axes[:, 1] < settings.min_axis_ratio * dots.semi_axes[:, 0]),
-        (Reason.STRUCTURE, dots.misfit > settings.max_misfit),
-        # an edge as soft as the dot is large: glare, a reflection out of focus
-        (Reason.STRUCTURE, ~dots.is_spot & (dots.s > 0.8 * dots.semi_axes[:, 1] + 0.5)),
-    )
-    good = np.ones(n, bool)
-    for reason, bad in tests:
-        for row in np.flatnonzero(good & bad):
-            log.add(*dots.xy[row], dots.semi_axes[row, 0], reason)
-        good &= ~bad
-    return dots.take(good)
-
-
 def _read(
     image: NDArray, dots: FittedDots, noise: NoiseModel, saturation: float, settings: DetectionSettings
 ) -> tuple[RingReadings, FittedDots]:
@@ -215,20 +157,6 @@ def _readings(
     )
 
 
-def _without_ring_parts(
-    candidates: Candidates, dots: FittedDots, readings: RingReadings, log: RejectionLog
-) -> Candidates:
-    """The late candidates that are not part of a ring around an accepted dot, read or not."""
-    keep = np.ones(len(candidates), bool)
-    for host in np.flatnonzero(readings.evidence):
-        rho = _relative_radius(candidates.xy, dots.xy[host], dots.semi_axes[host], float(dots.angle[host]))
-        # a segment lies between 2 and 3; an uncoded dot of the same size would reach out of that band
-        keep &= ~((rho > 1.8) & (rho < 3.2))
-    for row in np.flatnonzero(~keep):
-        log.add(*candidates.xy[row], candidates.semi_axes[row, 0], Reason.RING_PART)
-    return candidates.take(keep)
-
-
 def _merged(
     image: NDArray, dots: FittedDots, readings: RingReadings, more: FittedDots, noise: NoiseModel, saturation: float,
     settings: DetectionSettings,
@@ -245,46 +173,17 @@ def _merged(
     return joined, both
 
 
-def _without_duplicates(
-    dots: FittedDots, readings: RingReadings, log: RejectionLog
-) -> tuple[FittedDots, RingReadings]:
-    """One dot per place: of overlapping ones the coded, then the better fitting one; no dot inside a read ring."""
-    n = len(dots)
-    if n < 2:
-        return dots, readings
-    from scipy.spatial import cKDTree
-
-    order = np.lexsort((dots.misfit + dots.residual, readings.code < 0))
-    tree = cKDTree(dots.xy)
-    keep = np.ones(n, bool)
-    reach = np.where(readings.code >= 0, 3.1, 0.9) * dots.semi_axes[:, 0]
-    for row in order:
-        if not keep[row]:
-            continue
-        for other in tree.query_ball_point(dots.xy[row], reach[row]):
-            if other == row or not keep[other]:
-                continue
-            rho = _relative_radius(
-                dots.xy[other : other + 1], dots.xy[row], dots.semi_axes[row], float(dots.angle[row])
-            )[0]
-            ring = readings.code[row] >= 0 and rho < 3.05
-            if rho < 0.9 or (ring and readings.code[other] < 0):
-                keep[other] = False
-                log.add(*dots.xy[other], dots.semi_axes[other, 0], Reason.RING_PART if ring else Reason.DUPLICATE)
-    kept = RingReadings(*(getattr(readings, f)[keep] for f in RingReadings.__dataclass_fields__))
-    return dots.take(keep), kept
-
-
 def _columns(dots: FittedDots, readings: RingReadings, settings: DetectionSettings, top: int) -> dict[str, NDArray]:
-    n = len(dots)
     dark = settings.polarity == "dark"
-    state = np.where(readings.code >= 0, CodeState.READ, np.where(readings.evidence, CodeState.UNREADABLE, CodeState.NONE))
+    state = np.where(
+        readings.code >= 0, CodeState.READ, np.where(readings.evidence, CodeState.UNREADABLE, CodeState.NONE)
+    )
     return {
         "xy": dots.xy, "covariance": dots.covariance, "semi_axes": dots.semi_axes, "angle": dots.angle,
         "contrast": -dots.contrast if dark else dots.contrast,
         "background": top - dots.background if dark else dots.background, "saturated": dots.saturated,
         "code": readings.code.astype(np.int64),
-        "kind": np.where(readings.code >= 0, TargetKind.RING12, TargetKind.DOT).astype(np.int8) if n else np.zeros(0, np.int8),
+        "kind": np.where(readings.code >= 0, int(TargetKind.RING12), int(TargetKind.DOT)).astype(np.int8),
         "code_state": np.asarray(state, dtype=np.int8), "blur": blur_without_pixel(dots.s), "residual": dots.residual,
         "chi2": dots.chi2, "gain_gradient": dots.gain_gradient,
     }  # fmt: skip

@@ -144,6 +144,11 @@ class RejectionLog:
         if len(self._entries) < self._keep:
             self._entries.append((float(x), float(y), float(size), reason))
 
+    def add_rows(self, xy: Array, size: Array, reason: Reason) -> None:
+        """Several candidates (k, 2) with sizes (k,) for one reason."""
+        for place, extent in zip(xy, size, strict=True):
+            self.add(place[0], place[1], extent, reason)
+
     def count(self, reason: Reason, number: int) -> None:
         """Counts candidates without place."""
         if number:

@@ -12,11 +12,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from robcal.imaging.edge_model import axes_from_matrix, matrix_from_axes, signed_distance
-from robcal.imaging.ellipse_fit import EllipseFits, evaluate, free_shading, iterate, outliers, start
-from robcal.imaging.noise import NoiseModel, correlation_factor, with_gain
+from robcal.imaging.blobs import Candidates
+from robcal.imaging.edge_model import axes_from_matrix, matrix_from_axes
+from robcal.imaging.ellipse_fit import EllipseFits, iterate, outliers, start
+from robcal.imaging.image_statistics import noise_around, noise_correlation, noise_inside, shading_priors, without_doubt
+from robcal.imaging.noise import NoiseModel
 from robcal.imaging.ring_code import RingReadings, ring_glare
-from robcal.imaging.segmentation import Candidates
 from robcal.imaging.windows import Windows, gather_windows
 
 Array = NDArray[np.float64]
@@ -24,7 +25,6 @@ Array = NDArray[np.float64]
 _PIXEL_VARIANCE = 1.0 / 12.0
 # systematic part of the centre that no noise covers (model misfit, pixel response), px; see edge_model
 _FLOOR_EDGE, _FLOOR_SPOT = 0.001, 0.006
-_SHADING_TOLD = 0.02  # sigma of a dot's relative gradient per radius above which it cannot tell shading from shift
 _SPOT_RATIO, _SPOT_RATIO_ROUND = 1.7, 1.2  # minor semi-axis by s below which a tilted, a round dot is a spot
 
 
@@ -76,9 +76,7 @@ class FittedDots:
     def as_candidates(self) -> Candidates:
         """The fits as starts for another fit."""
         blur = np.maximum(self.s, 0.3)
-        return Candidates(
-            self.xy, self.semi_axes, self.angle, self.background, self.background + self.contrast, blur
-        )
+        return Candidates(self.xy, self.semi_axes, self.angle, self.background, self.background + self.contrast, blur)
 
 
 def fit_dots(
@@ -94,11 +92,11 @@ def fit_dots(
     max_misfit : fits with three times this misfit (by contrast) after the first round are given up.
     """
     groups, fits = _first_round(image, candidates, noise, saturation, max_misfit)
-    clean = [_clean(window, fit, max_misfit) for window, fit in zip(groups, fits, strict=True)]
-    noise = _noise_inside(groups, fits, clean, _noise_around(groups, fits, clean, noise))
+    clean = [without_doubt(window, fit, max_misfit) for window, fit in zip(groups, fits, strict=True)]
+    noise = noise_inside(groups, fits, clean, noise_around(groups, fits, clean, noise))
     fits = [iterate(fit, window, noise, 2, tolerance=0.05) for window, fit in zip(groups, fits, strict=True)]
-    shading, prior = _shading(groups, fits)
-    noise = replace(noise, correlation=_correlation(groups, fits, clean))
+    shading, prior = shading_priors(groups, fits)
+    noise = replace(noise, correlation=noise_correlation(groups, fits, clean))
     results = []
     for window, fit in zip(groups, fits, strict=True):
         results.append(_finish(fit, window, noise, shading[window.index], candidates))
@@ -156,113 +154,6 @@ def _first_round(
             kept_groups.append(window)
             kept_fits.append(iterate(fit, window, noise, 8, tolerance=0.2))
     return kept_groups, kept_fits
-
-
-def _clean(window: Windows, fit: EllipseFits, max_misfit: float) -> NDArray[np.bool_]:
-    """(n,) fits that are dots without doubt: only these tell about the image's noise."""
-    used = np.maximum((fit.weight > 0).sum(axis=1), 1)
-    rms = np.sqrt(np.where(fit.weight > 0, fit.residual**2, 0.0).sum(axis=1) / used)
-    return fit.converged & (rms < max_misfit * np.abs(fit.parameters[:, 9])) & (used > 24)
-
-
-def _noise_around(
-    groups: list[Windows], fits: list[EllipseFits], clean: list[NDArray[np.bool_]], noise: NoiseModel
-) -> NoiseModel:
-    """The noise model with the read noise seen around the dots, where it is more than the quietest parts show."""
-    found = []
-    for window, fit, good in zip(groups, fits, clean, strict=True):
-        background = (fit.weight > 0) & _is_background(window, fit)
-        count = background.sum(axis=1)
-        use = good & (count >= 20)
-        squares = np.where(background, fit.residual**2, 0.0).sum(axis=1)
-        # three parameters of the background plane, two more for what the edge takes
-        found.append((squares[use] / (count[use] - 5.0)) - noise.gain * (fit.parameters[use, 6] - noise.level))
-    variances = np.concatenate(found) if found else np.zeros(0)
-    if len(variances) < 8:
-        return noise
-    typical = float(np.median(variances))
-    return replace(noise, variance=typical) if typical > 1.3 * noise.variance else noise
-
-
-def _is_background(window: Windows, fit: EllipseFits) -> NDArray[np.bool_]:
-    distance = signed_distance(fit.parameters, window.x, window.y)
-    return distance > 2.4 * np.exp(fit.parameters[:, 5, None])
-
-
-def _noise_inside(
-    groups: list[Windows], fits: list[EllipseFits], clean: list[NDArray[np.bool_]], noise: NoiseModel
-) -> NoiseModel:
-    """The noise model with the gain seen on the bright pixels of the dots, by residuals and their redundancy."""
-    grey, variance, weights = [], [], []
-    for window, fit, good in zip(groups, fits, clean, strict=True):
-        use = np.flatnonzero(good)
-        if use.size == 0:
-            continue
-        part, chosen = window.take(use), fit.take(use)
-        model, jacobian = evaluate(chosen.parameters, part, chosen.is_spot)
-        inverse = chosen.covariance()
-        inverse[~np.isfinite(inverse)] = 0.0
-        leverage = chosen.weight * np.einsum("npi,npi->np", np.matmul(jacobian, inverse), jacobian)
-        half = chosen.parameters[:, 6, None] + 0.6 * chosen.parameters[:, 9, None]
-        bright = (chosen.weight > 0) & (model > half)
-        free = np.where(bright, np.clip(1.0 - leverage, 0.0, 1.0), 0.0)
-        redundancy = free.sum(axis=1)
-        enough = redundancy > 0.1
-        squares = np.where(bright, chosen.residual**2, 0.0).sum(axis=1)
-        variance.append((squares / np.maximum(redundancy, 1e-9))[enough])
-        grey.append(((free * model).sum(axis=1) / np.maximum(redundancy, 1e-9))[enough])
-        weights.append(redundancy[enough])
-    if not grey:
-        return noise
-    return with_gain(noise, np.concatenate(grey), np.concatenate(variance), np.concatenate(weights))
-
-
-def _correlation(groups: list[Windows], fits: list[EllipseFits], clean: list[NDArray[np.bool_]]) -> float:
-    """Noise correlation from the residuals of neighbouring background pixels (rows are in reading order)."""
-    products, squares, count = [], [], 0
-    for window, fit, good in zip(groups, fits, clean, strict=True):
-        background = (fit.weight > 0) & good[:, None] & _is_background(window, fit)
-        pair = background[:, :-1] & background[:, 1:]
-        pair &= (window.x[:, 1:] - window.x[:, :-1] == 1) & (window.y[:, 1:] == window.y[:, :-1])
-        normalised = np.clip(fit.residual * np.sqrt(fit.weight), -4.0, 4.0)
-        left, right = normalised[:, :-1], normalised[:, 1:]
-        products.append(np.where(pair, left * right, 0.0).sum(axis=1)[good])
-        squares.append(np.where(pair, 0.5 * (left**2 + right**2), 0.0).sum(axis=1)[good])
-        count += int(pair.sum())
-    if count < 300:
-        return 1.0
-    product, square = np.concatenate(products), np.concatenate(squares)
-    # the middle of the dots: single ones have texture around them
-    use = square > 0
-    lag_one = product[use] / square[use]
-    order = np.argsort(lag_one)
-    weight = np.cumsum(square[use][order])
-    kept = order[(weight > 0.25 * weight[-1]) & (weight <= 0.75 * weight[-1])] if len(order) >= 8 else order
-    return correlation_factor(float(product[use][kept].sum() / square[use][kept].sum()))
-
-
-def _shading(groups: list[Windows], fits: list[EllipseFits]) -> tuple[Array, float]:
-    """Prior sigma of each dot's relative gain gradient per radius, (n,), and the common one of the image, per px."""
-    n = max((int(window.index.max()) + 1 for window in groups), default=0)
-    square, variance, good, radius = np.zeros(n), np.ones(n), np.zeros(n, bool), np.ones(n)
-    for window, fit in zip(groups, fits, strict=True):
-        gradient, expected = free_shading(fit)
-        dof = np.maximum((fit.weight > 0).sum(axis=1) - 10, 1)
-        chi2 = np.einsum("np,np,np->n", fit.weight, fit.residual, fit.residual) / dof
-        rows = window.index
-        square[rows] = 0.5 * (gradient**2).sum(axis=1) / window.radius**2
-        variance[rows] = expected * np.maximum(chi2, 1.0) / window.radius**2
-        good[rows], radius[rows] = (chi2 < 50.0) & (expected < _SHADING_TOLD**2), window.radius
-    common = 0.0
-    if good.any():
-        s, v = square[good], variance[good]
-        keep = s <= np.quantile(s, 0.95) if len(s) >= 20 else np.ones(len(s), bool)
-        for _ in range(8):
-            weight = 1.0 / (v[keep] + common) ** 2
-            common = max(0.0, float((weight * (s[keep] - v[keep])).sum() / weight.sum()))
-    # a dot with a gradient beyond what is usual here (99.9 % of two normal numbers) is left free, if it can tell at all
-    unusual = (square > 6.9 * (variance + common)) & (variance * radius**2 < _SHADING_TOLD**2)
-    return radius * np.sqrt(np.where(unusual, square, common)), float(np.sqrt(common))
 
 
 def _finish(fit: EllipseFits, window: Windows, noise: NoiseModel, shading: Array, candidates: Candidates) -> dict:
@@ -325,11 +216,13 @@ def _columns(fit: EllipseFits, window: Windows, noise: NoiseModel) -> dict:
 
 
 def _join(results: list[dict], groups: list[Windows]) -> FittedDots:
-    """Columns of all groups in the order of the candidates that were fitted; axes of spots by the blur of the others."""
+    """Columns of all groups in the order of the candidates fitted; axes of spots by the blur of the others."""
     if not results:
+        real, flag = np.zeros(0), np.zeros(0, bool)
         return FittedDots(
-            np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros((0, 3)), np.zeros((0, 2)), *(np.zeros(0) for _ in range(4)),
-            np.zeros((0, 2)), *(np.zeros(0) for _ in range(3)), *(np.zeros(0, bool) for _ in range(3)), np.zeros(0),
+            xy=np.zeros((0, 2)), covariance=np.zeros((0, 2, 2)), b=np.zeros((0, 3)), semi_axes=np.zeros((0, 2)),
+            angle=real, s=real, background=real, contrast=real, gain_gradient=np.zeros((0, 2)), chi2=real, misfit=real,
+            residual=real, saturated=flag, converged=flag, is_spot=flag, shading_sigma=real,
         )  # fmt: skip
     order = np.argsort(np.concatenate([window.index for window in groups]))
     columns = {name: np.concatenate([result[name] for result in results])[order] for name in results[0]}
@@ -347,6 +240,3 @@ def _join(results: list[dict], groups: list[Windows]) -> FittedDots:
 def blur_without_pixel(s: Array) -> Array:
     """Standard deviation of the lens's blur from that of the edge profile."""
     return np.sqrt(np.maximum(s**2 - _PIXEL_VARIANCE, 0.0))
-
-
-__all__ = ["FittedDots", "blur_without_pixel", "evaluate", "fit_dots", "refit_coded"]

@@ -121,9 +121,7 @@ class _System:
     residual: Array
 
 
-def _system(
-    parameters: Array, prior_blur: Array, windows: Windows, fits: EllipseFits, precision: Array
-) -> _System:
+def _system(parameters: Array, prior_blur: Array, windows: Windows, fits: EllipseFits, precision: Array) -> _System:
     """Normal equations with priors at the given parameters; `precision` (n, p) of the pixels, 0 if left out."""
     model, jacobian = evaluate(parameters, windows, fits.is_spot)
     residual = windows.value - model
@@ -201,7 +199,9 @@ def iterate(
         move = np.einsum("ni,nij,nj->n", step, normal[active], step)
         # of misfit as large as k sigma the minimum need not be known better than k sigma
         move /= np.maximum(1.0, cost[active] / np.maximum((weight[active] > 0).sum(axis=1), 1))
-        done = (better & (move < tolerance**2)) | (~better & (damping[active] > 1e4)) | (~better & (move < tolerance**2))
+        done = (
+            (better & (move < tolerance**2)) | (~better & (damping[active] > 1e4)) | (~better & (move < tolerance**2))
+        )
         converged[active[done]] = True
         active = active[~done]
         if active.size == 0:
@@ -256,7 +256,9 @@ def outliers(fits: EllipseFits, windows: Windows) -> NDArray[np.bool_]:
     contrast = np.abs(fits.parameters[:, 9, None])
     normalised = np.abs(fits.residual) * np.sqrt(fits.weight)
     # the model's own misfit is the typical residual
-    typical = np.sqrt(np.einsum("np,np->n", fits.weight, fits.residual**2) / np.maximum((fits.weight > 0).sum(axis=1), 1))
+    typical = np.sqrt(
+        np.einsum("np,np->n", fits.weight, fits.residual**2) / np.maximum((fits.weight > 0).sum(axis=1), 1)
+    )
     limit = _OUTLIER_SIGMA * np.maximum(1.0, np.minimum(typical, 3.0))[:, None]
     flagged = windows.valid & (normalised > limit) & (np.abs(fits.residual) > 0.06 * contrast)
     # more than a few percent of outliers is not dust but another shape

@@ -170,7 +170,7 @@ def _pooled(lift: Array, variance: Array, weight: Array) -> tuple[Array, Array, 
     return (
         np.bincount(group, (weight * lift)[order]) / total,
         np.bincount(group, (weight * variance)[order]) / total,
-        total,
+        total.astype(np.float64),
     )
 
 

@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 
 def _crop(image: NDArray, xy: Array, half: int) -> tuple[Array, int, int]:
     height, width = image.shape
-    x, y = int(round(float(xy[0]))), int(round(float(xy[1])))
+    x, y = round(float(xy[0])), round(float(xy[1]))
     x0, y0 = max(0, x - half), max(0, y - half)
     return image[y0 : min(height, y + half + 1), x0 : min(width, x + half + 1)].astype(float), x0, y0
 
@@ -49,7 +49,7 @@ def contour_centres(image: NDArray, xy: Array, semi_axes: Array, background: Arr
     result = np.full((len(xy), 2), np.nan)
     for row, place in enumerate(np.asarray(xy, dtype=float)):
         crop, x0, y0 = _crop(image, place, int(np.ceil(semi_axes[row].max() + 4.0)))
-        here = place - (x0, y0)
+        here = place - np.array([x0, y0])
         best: tuple[float, Array] | None = None
         for contour in find_contours(crop, background[row] + 0.5 * contrast[row]):
             if len(contour) < 8 or not np.allclose(contour[0], contour[-1]):
@@ -61,7 +61,7 @@ def contour_centres(image: NDArray, xy: Array, semi_axes: Array, background: Arr
             continue
         model = _ellipse_through(best[1])
         if model is not None:
-            result[row] = model + (x0, y0)
+            result[row] = model + np.array([x0, y0])
     return result
 
 

@@ -120,7 +120,7 @@ def read_rings(
 
     Parameters
     ----------
-    image : (h, w), bright dots. xy : (n, 2). b : (n, 3) ellipse matrix B11, B12, B22 (B maps pixels to the unit circle).
+    image : (h, w), bright dots. xy : (n, 2). b : (n, 3) ellipse matrix B11, B12, B22 (pixels to unit circle).
     blur : (n,) s of the edge profile, px. background, contrast : (n,) grey values. noise_sigma : (n,) of one pixel.
     saturation : grey value above which nothing is known. known_codes : only these are codes.
     """

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from robcal.imaging.blobs import Candidates, judge, rough_sigma
 from robcal.imaging.detections import Reason, RejectionLog
 from robcal.imaging.noise import NoiseModel
 from robcal.imaging.settings import DetectionSettings
@@ -27,35 +28,6 @@ _MAX_PARTS = 3000  # connected parts above the background, holes included; beyon
 _MAX_LARGE = 40  # large parts that are searched with a finer background
 _MAX_DEPTH = 7
 _CROSS = np.ones((5, 5), np.uint8)
-
-
-@dataclass(frozen=True)
-class Candidates:
-    """Blobs that may be dots, n of them, from moments of their pixels: a start for the fit.
-
-    Attributes
-    ----------
-    xy : (n, 2). semi_axes : (n, 2) major first. angle : (n,) rad. base, peak : (n,) grey values. blur : (n,) px.
-    nodes_exhausted : the image had more structure than is looked at.
-    """
-
-    xy: Array
-    semi_axes: Array
-    angle: Array
-    base: Array
-    peak: Array
-    blur: Array
-    nodes_exhausted: bool = False
-
-    def __len__(self) -> int:
-        return len(self.xy)
-
-    def take(self, chosen: NDArray) -> Candidates:
-        """The chosen rows."""
-        return Candidates(
-            self.xy[chosen], self.semi_axes[chosen], self.angle[chosen], self.base[chosen], self.peak[chosen],
-            self.blur[chosen], self.nodes_exhausted,
-        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -85,9 +57,7 @@ def coarse_background(image: NDArray, max_axis_px: float) -> NDArray:
     return cv2.resize(opened, (width, height), interpolation=cv2.INTER_LINEAR)
 
 
-def find_candidates(
-    image: NDArray, noise: NoiseModel, settings: DetectionSettings, log: RejectionLog
-) -> Candidates:
+def find_candidates(image: NDArray, noise: NoiseModel, settings: DetectionSettings, log: RejectionLog) -> Candidates:
     """Blobs brighter than their surroundings that could be the image of a dot.
 
     Parameters
@@ -97,7 +67,7 @@ def find_candidates(
     """
     nodes = _nodes_above_background(image, settings.max_axis_px, noise, settings, log)
     # a part too large to be a dot may carry dots: what rises above a finer background within it
-    for node in nodes[: _MAX_LARGE]:
+    for node in nodes[:_MAX_LARGE]:
         if max(node.mask.shape) > 2.2 * settings.max_axis_px + 2.0:
             nodes += _finer_nodes(node, image, settings.max_axis_px / 4.0, noise, settings, log)
     found: list[tuple[float, ...]] = []
@@ -126,7 +96,7 @@ def _nodes_above_background(
     offset = max(0.0, float(np.median(image[::every, ::every].astype(float) - typical)))
     lift = offset + max(5.0 * float(np.sqrt(noise.at(float(np.median(typical))))), 1.5 * noise.step)
     while True:
-        threshold = cv2.add(background, float(min(int(np.ceil(lift)), top)))
+        threshold = _raised(background, int(np.ceil(lift)))
         above = cv2.compare(image, threshold, cv2.CMP_GT)
         contours, hierarchy = cv2.findContours(above, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
         # texture and dust without end: look at what stands out more
@@ -135,6 +105,12 @@ def _nodes_above_background(
             break
         lift *= 1.6
     return _first_nodes(above, background, offset, contours, hierarchy, settings, log)
+
+
+def _raised(image: NDArray, lift: int) -> NDArray:
+    """The image plus a constant, cut off at the top of its range."""
+    top = int(np.iinfo(image.dtype).max)
+    return np.minimum(image, top - min(lift, top)) + image.dtype.type(min(lift, top))
 
 
 def _finer_nodes(
@@ -170,7 +146,7 @@ def _distinct(rows: Array) -> Array:
 
 
 def _first_nodes(
-    above: NDArray[np.uint8], background: NDArray, offset: float, contours: Sequence[NDArray],
+    above: NDArray, background: NDArray, offset: float, contours: Sequence[NDArray],
     hierarchy: NDArray | None, settings: DetectionSettings, log: RejectionLog,
 ) -> list[_Node]:  # fmt: skip
     """Connected parts above the background, by contours (fast where there are few), small ones last in the list."""
@@ -181,7 +157,7 @@ def _first_nodes(
     outer = np.flatnonzero(hierarchy[0][:, 3] < 0)
     boxes: list[tuple[int, int, int, int, int, int, int]] = []
     for index in outer:
-        contour = contours[index]
+        contour = contours[int(index)]
         if len(contour) < 3:
             small += 1
             continue
@@ -222,14 +198,14 @@ def _split(
     # a high but not the highest value: one hot pixel is no peak
     rank = min(3, inside.size // 6)
     peak = float(inside.max() if rank == 0 else np.partition(inside, inside.size - 1 - rank)[inside.size - 1 - rank])
-    sigma = max(float(np.sqrt(noise.at(node.base))), _rough_sigma(crop, node.mask) if inside.size > 200 else 0.0)
+    sigma = max(float(np.sqrt(noise.at(node.base))), rough_sigma(crop, node.mask) if inside.size > 200 else 0.0)
     if peak - node.base < 0.6 * settings.min_contrast_sigma * sigma:
         if node.depth == 0:
             log.add(node.x + width / 2, node.y + height / 2, max(width, height) / 2, Reason.CONTRAST)
         return
     level = 0.5 * (node.base + peak)
-    core = cv2.bitwise_and(cv2.compare(crop, level, cv2.CMP_GT), node.mask)
-    number, labels, stats, centroids = cv2.connectedComponentsWithStats(core, connectivity=4, ltype=cv2.CV_32S)
+    core = ((crop > level) & (node.mask > 0)).view(np.uint8)
+    number, labels, stats, _ = cv2.connectedComponentsWithStats(core, connectivity=4, ltype=cv2.CV_32S)
     for part in range(1, number):
         left, upper, w, h, area = (int(value) for value in stats[part])
         if area < 2:
@@ -242,13 +218,16 @@ def _split(
         # crumbs of noise along the level's contour on a slope
         if part_peak - level < 0.3 * settings.min_contrast_sigma * sigma:
             continue
-        reason = _judge(mask, crop[box], area, level, node.base, (x, y), image.shape, settings, found)
+        reason = judge(mask, crop[box], area, level, node.base, (x, y), image.shape, settings, found)
         if reason is None:
             continue
         # an evenly bright part has no dots of its own inside
         even = float(values.mean()) - level > 0.5 * (part_peak - level)
-        if node.depth < _MAX_DEPTH and area > 12 and (not even or reason is Reason.TOO_LARGE) and part_peak - level > (
-            settings.min_contrast_sigma * sigma
+        if (
+            node.depth < _MAX_DEPTH
+            and area > 12
+            and (not even or reason is Reason.TOO_LARGE)
+            and part_peak - level > (settings.min_contrast_sigma * sigma)
         ):
             nodes.append(_Node(x, y, mask, level, node.depth + 1))
             if reason is not Reason.TOO_LARGE:
@@ -259,18 +238,6 @@ def _split(
         rest = np.where(cv2.dilate(core, _CROSS) > 0, 0, node.mask).astype(np.uint8)
         if np.count_nonzero(rest) >= 6:
             _add_rest(rest, node, crop, settings.min_contrast_sigma * sigma, nodes)
-
-
-def _rough_sigma(crop: NDArray, mask: NDArray[np.uint8]) -> float:
-    """Noise inside a large node, by the median of second differences along rows."""
-    values = crop.astype(np.float32)
-    second = values[:, 2:] - 2.0 * values[:, 1:-1] + values[:, :-2]
-    inside = (mask[:, 2:] > 0) & (mask[:, :-2] > 0)
-    if np.count_nonzero(inside) < 50:
-        return 0.0
-    # mean of the smaller half of |z| is 0.319 sigma; unlike the median it is not quantised
-    size = np.abs(second[inside])
-    return float(np.partition(size, size.size // 2)[: size.size // 2].mean() / (0.319 * np.sqrt(6.0)))
 
 
 def _add_rest(rest: NDArray[np.uint8], node: _Node, crop: NDArray, lift: float, nodes: list[_Node]) -> None:
@@ -284,75 +251,3 @@ def _add_rest(rest: NDArray[np.uint8], node: _Node, crop: NDArray, lift: float, 
         mask = (labels[box] == part).view(np.uint8)
         if float(crop[box][mask > 0].max()) - node.base > lift:
             nodes.append(_Node(node.x + left, node.y + upper, mask, node.base, node.depth + 1))
-
-
-def _judge(
-    mask: NDArray[np.uint8], crop: NDArray, area: int, level: float, base: float, corner: tuple[int, int],
-    shape: tuple[int, ...], settings: DetectionSettings, found: list[tuple[float, ...]],
-) -> Reason | None:  # fmt: skip
-    """None and an entry in `found` if the blob may be a dot, else why not."""
-    height, width = mask.shape
-    x, y = corner
-    if max(width, height) > 2.2 * settings.max_axis_px + 2.0:
-        return Reason.TOO_LARGE
-    moments = cv2.moments(mask, binaryImage=True)
-    cx, cy = moments["m10"] / area, moments["m01"] / area
-    # a pixel is an area: 1/12 belongs to the second moments
-    sxx, syy = moments["mu20"] / area + 1 / 12, moments["mu02"] / area + 1 / 12
-    sxy = moments["mu11"] / area
-    mean, radius = 0.5 * (sxx + syy), float(np.hypot(0.5 * (sxx - syy), sxy))
-    major, minor = 2.0 * np.sqrt(mean + radius), 2.0 * np.sqrt(max(mean - radius, 1e-6))
-    fill = area / (np.pi * major * minor)
-    if minor < 0.6 * settings.min_axis_px:
-        return Reason.TOO_SMALL if area < 9 else Reason.ELONGATED
-    if major > 1.15 * settings.max_axis_px + 1.0:
-        return Reason.TOO_LARGE
-    if minor < 0.8 * settings.min_axis_ratio * major:
-        return Reason.ELONGATED
-    # filled ellipses have 1; half rings, crosses, squares with holes have less. Few pixels scatter
-    if abs(fill - 1.0) > 0.08 + 0.9 / np.sqrt(area):
-        return Reason.SHAPE
-    if x <= 1 or y <= 1 or x + width >= shape[1] - 1 or y + height >= shape[0] - 1:
-        return Reason.BORDER
-    values = crop[mask > 0]
-    peak = float(values.max())
-    high = int(np.count_nonzero(values > 0.5 * (level + peak)))
-    # between the levels 1/2 and 3/4 lie 0.674 sigma of a blurred edge, along the perimeter
-    blur = (area - high) / (0.674 * 2.0 * np.pi * np.sqrt(0.5 * (major**2 + minor**2)))
-    angle = 0.5 * np.arctan2(2.0 * sxy, sxx - syy)
-    found.append((x + cx, y + cy, major, minor, float(angle), base, peak, float(np.clip(blur, 0.35, 0.5 * minor + 0.5))))
-    return None
-
-
-def step_all_around(image: NDArray, candidates: Candidates) -> NDArray[np.bool_]:
-    """(n,) True where the grey value falls across the outline in nearly every direction and about equally.
-
-    A cheap test before the fit: parts of textures, corners and arcs fail it, dots beside others do not.
-    """
-    n = len(candidates)
-    if n == 0:
-        return np.zeros(0, bool)
-    height, width = image.shape
-    phi = np.arange(24) * (2.0 * np.pi / 24)
-    c, s = np.cos(candidates.angle)[:, None], np.sin(candidates.angle)[:, None]
-    a, b = candidates.semi_axes[:, :1], candidates.semi_axes[:, 1:]
-    # outline, and its normal
-    ex, ey = a * np.cos(phi), b * np.sin(phi)
-    nx, ny = np.cos(phi) / a, np.sin(phi) / b
-    length = np.hypot(nx, ny)
-    reach = np.minimum(1.5 * candidates.blur + 1.0, 0.7 * b[:, 0])[:, None]
-    out = np.minimum(1.5 * candidates.blur[:, None] + 1.0, 0.55 * b + 0.8)
-    values = []
-    for distance in (-reach, out):
-        ux, uy = ex + distance * nx / length, ey + distance * ny / length
-        x = np.clip(np.rint(candidates.xy[:, :1] + c * ux - s * uy), 0, width - 1).astype(int)
-        y = np.clip(np.rint(candidates.xy[:, 1:] + s * ux + c * uy), 0, height - 1).astype(int)
-        values.append(image[y, x].astype(float))
-    inner, outer = values
-    step = inner - outer
-    typical = np.median(step, axis=1)
-    low = np.sort(step, axis=1)[:, 3]
-    # in blobs of two pixels the nearest pixel stands for too much
-    tiny = candidates.semi_axes[:, 1] < 1.5
-    low = np.where(tiny, typical, low)
-    return (typical > 0) & (low > 0.15 * typical) & (np.median(np.abs(step - typical[:, None]), axis=1) < 0.35 * typical)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from robcal.imaging.blobs import Candidates
 from robcal.imaging.edge_model import matrix_from_axes, signed_distance
-from robcal.imaging.segmentation import Candidates
 
 Array = NDArray[np.float64]
 
@@ -57,9 +57,7 @@ def _dilate(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return wide
 
 
-def gather_windows(
-    image: NDArray, candidates: Candidates, saturation: float, neighbours: bool = True
-) -> list[Windows]:
+def gather_windows(image: NDArray, candidates: Candidates, saturation: float, neighbours: bool = True) -> list[Windows]:
     """Windows of all candidates in groups of similar size.
 
     Parameters
@@ -70,9 +68,8 @@ def gather_windows(
     n = len(candidates)
     if n == 0:
         return []
-    shape = np.column_stack([
-        candidates.xy, matrix_from_axes(candidates.semi_axes, candidates.angle), np.log(np.maximum(candidates.blur, 0.3))
-    ])  # fmt: skip
+    matrix = matrix_from_axes(candidates.semi_axes, candidates.angle)
+    shape = np.column_stack([candidates.xy, matrix, np.log(np.maximum(candidates.blur, 0.3))])
     margin = 3.0 * candidates.blur + 1.5
     # half extents of the ellipse along x and y
     c2, s2 = np.cos(candidates.angle) ** 2, np.sin(candidates.angle) ** 2

@@ -1,4 +1,4 @@
-"""Small renderer of the tests: ellipses and ring codes by supersampling, Gaussian blur, noise. Knows nothing of robcal."""
+"""The tests' renderer: ellipses and ring codes by supersampling, Gaussian blur, noise. Independent of robcal."""
 
 from __future__ import annotations
 
@@ -26,7 +26,12 @@ class Dot:
 
 
 def render(
-    width: int, height: int, dots: list[Dot], blur: float = 0.7, sub: int = 8, gradient: tuple[float, float] = (0.0, 0.0)
+    width: int,
+    height: int,
+    dots: list[Dot],
+    blur: float = 0.7,
+    sub: int = 8,
+    gradient: tuple[float, float] = (0.0, 0.0),
 ) -> Array:
     """Light in 0..1, (height, width); `gradient` is the relative change of each dot's brightness per pixel."""
     light = np.zeros((height, width))

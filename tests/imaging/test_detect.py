@@ -83,7 +83,9 @@ def test_full_scene(bits: int) -> None:
     dots = scene(rng, 900, 700, 40, (4.5, 9.0), [int(k) for k in rng.choice(ids, 15, replace=False)], 3.4)
     light = render(900, 700, dots, BLUR)
     scale = 1.0 if bits == 8 else 250.0
-    image = expose(light, rng, contrast=180 * scale, background=15 * scale, read_noise=scale, gain=0.05 * scale, bits=bits)
+    image = expose(
+        light, rng, contrast=180 * scale, background=15 * scale, read_noise=scale, gain=0.05 * scale, bits=bits
+    )
     found = detect_targets(image)
     error, row = errors(found, dots)
     assert len(found) == len(dots)
@@ -167,9 +169,7 @@ def test_images_of_nothing(image: np.ndarray, told: str) -> None:
 
 def test_photograph_of_something_else_has_no_code_and_ends() -> None:
     rng = np.random.default_rng(16)
-    field_ = sum(
-        np.kron(rng.normal(size=(600 // s, 800 // s)), np.ones((s, s))) * s for s in (2, 5, 20, 100)
-    )
+    field_ = sum(np.kron(rng.normal(size=(600 // s, 800 // s)), np.ones((s, s))) * s for s in (2, 5, 20, 100))
     image = np.clip(128 + 1.2 * field_ + rng.normal(0, 5, (600, 800)), 0, 255).astype(np.uint8)
     found = detect_targets(image)
     assert (found.code < 0).all()

@@ -43,9 +43,7 @@ def test_distance_is_exact_for_circles() -> None:
     np.testing.assert_allclose(edge_distance(shape, x, y)[0], distance, atol=1e-9)
 
 
-@given(
-    major=st.floats(0.5, 50), ratio=st.floats(0.2, 0.99), angle=st.floats(-np.pi / 2 + 0.01, np.pi / 2 - 0.01)
-)
+@given(major=st.floats(0.5, 50), ratio=st.floats(0.2, 0.99), angle=st.floats(-np.pi / 2 + 0.01, np.pi / 2 - 0.01))
 @settings(max_examples=60, deadline=None)
 def test_axes_and_matrix_are_inverse(major: float, ratio: float, angle: float) -> None:
     axes, back = axes_from_matrix(matrix_from_axes(np.array([[major, ratio * major]]), np.array([angle])))

@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from robcal.imaging.blobs import Candidates
 from robcal.imaging.ellipse_fit import evaluate, grey_values, iterate, start
 from robcal.imaging.noise import NoiseModel
-from robcal.imaging.segmentation import Candidates
 from robcal.imaging.windows import gather_windows
 from tests.imaging.rendering import Dot, expose, render
 
@@ -26,7 +26,9 @@ def test_derivatives_agree_with_differences() -> None:
     for k in range(12):
         step = np.zeros(12)
         step[k] = 1e-5
-        difference = (grey_values(parameters + step, window, edge) - grey_values(parameters - step, window, edge)) / 2e-5
+        difference = (
+            grey_values(parameters + step, window, edge) - grey_values(parameters - step, window, edge)
+        ) / 2e-5
         np.testing.assert_allclose(jacobian[..., k], difference, atol=2e-4)
 
 
