@@ -1,0 +1,123 @@
+"""What a report is made of: chapters of text, tables, figures, pictures and key figures. No HTML here."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from pipeline.runs import plain
+
+Grade = Literal["good", "care", "bad", "none"]
+
+
+@dataclass(frozen=True)
+class Text:
+    """A paragraph; `kind` 'lead', 'note' or 'plain'."""
+
+    text: str
+    kind: str = "plain"
+
+
+@dataclass(frozen=True)
+class Bullets:
+    """A list of sentences; more than `shown` are folded away."""
+
+    items: tuple[str, ...]
+    title: str = ""
+    shown: int = 12
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table; cells are text already formatted. `numeric` columns are set flush right."""
+
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    caption: str = ""
+    numeric: frozenset[int] = frozenset()
+    shown: int = 60
+    emphasis: frozenset[int] = frozenset()
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A Plotly figure as plain data, with a caption that says what is to be seen."""
+
+    data: tuple[Mapping[str, Any], ...]
+    layout: Mapping[str, Any]
+    caption: str
+    alt: str
+    height: int = 360
+    wide: bool = True
+
+    @property
+    def payload(self) -> str:
+        """JSON that is safe inside a script element."""
+        text = json.dumps(plain({"data": list(self.data), "layout": dict(self.layout)}), allow_nan=False)
+        return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+
+
+@dataclass(frozen=True)
+class Picture:
+    """An embedded JPEG."""
+
+    jpeg_base64: str
+    caption: str
+    width: int
+    height: int
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """Pictures side by side."""
+
+    pictures: tuple[Picture, ...]
+    caption: str = ""
+
+
+@dataclass(frozen=True)
+class KeyFigure:
+    """One number of the top of the report."""
+
+    value: str
+    unit: str
+    name: str
+    detail: str = ""
+    grade: Grade = "none"
+
+
+Block = Text | Bullets | Table | Figure | Pictures
+
+
+@dataclass(frozen=True)
+class Chapter:
+    """A chapter; it is left out where it has no blocks."""
+
+    anchor: str
+    title: str
+    lead: str
+    blocks: tuple[Block, ...]
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The top of the report: how good, how it is known, what to load; `diagnosis` the sentence about what is missing."""
+
+    grade: Grade
+    word: str
+    sentence: str
+    reason: str
+    load: str
+    diagnosis: str = ""
+    figures: tuple[KeyFigure, ...] = field(default=())
+    table: Table | None = None
+
+
+def table(columns: Sequence[str], rows: Sequence[Sequence[object]], caption: str = "", text: Sequence[int] = (0,),
+          emphasis: Sequence[int] = (), shown: int = 60) -> Table:
+    """A table from anything that can be printed; all columns but `text` are numbers."""
+    numeric = frozenset(range(len(columns))) - frozenset(text)
+    cells = tuple(tuple("" if c is None else str(c) for c in row) for row in rows)
+    return Table(tuple(columns), cells, caption, numeric, shown, frozenset(emphasis))

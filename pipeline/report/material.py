@@ -1,0 +1,148 @@
+"""What a run holds for its report. A stage that did not run leaves None; nothing here computes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from pipeline.campaign import Campaign, read_campaign
+from pipeline.codec import StaleCache
+from pipeline.runs import Run, campaign_of, read_json, run_file
+from pipeline.stages.registry import STAGES
+from robcal.calibration.verification import Verification
+from robcal.errors import RobcalError
+from robcal.photogrammetry.measure_frames import MeasuredFrames
+from robcal.photogrammetry.measured_points import MeasuredPoints
+from robcal.photogrammetry.station_network import StationOrientation
+from robcal.photogrammetry.survey_types import SurveyResult
+
+
+@dataclass(frozen=True)
+class Material:
+    """A run and, where it is still there, its campaign."""
+
+    run: Run
+
+    @cached_property
+    def name(self) -> str:
+        """Name of the campaign."""
+        return str(read_json(run_file(self.run)).get("name", self.run.folder.name))
+
+    @cached_property
+    def campaign_folder(self) -> Path:
+        """Folder of the campaign."""
+        return campaign_of(self.run)
+
+    @cached_property
+    def campaign(self) -> Campaign | None:
+        """The campaign, None if it was moved or changed so that it cannot be read."""
+        try:
+            return read_campaign(self.campaign_folder)
+        except RobcalError:
+            return None  # the report tells what the run itself holds
+
+    @cached_property
+    def stages(self) -> tuple[str, ...]:
+        """Stages that ran, in order."""
+        campaign = self.campaign
+        names = [s.name for s in STAGES if campaign is None or s.applies(campaign)]
+        return tuple(name for name in names if name != "report" and self.run.record(name) is not None)
+
+    @cached_property
+    def result(self) -> dict[str, Any]:
+        """The stages' parts of result.json together."""
+        out: dict[str, Any] = {}
+        for name in self.stages:
+            record = self.run.record(name)
+            out |= dict(record.result) if record else {}
+        return out
+
+    @cached_property
+    def notes(self) -> tuple[tuple[str, str], ...]:
+        """(stage, sentence) about everything left out or assumed."""
+        out = [("campaign", n) for n in (*self.campaign.warnings, *self.campaign.notes)] if self.campaign else []
+        for name in self.stages:
+            record = self.run.record(name)
+            out += [(name, note) for note in record.notes] if record else []
+        return tuple(out)
+
+    @cached_property
+    def timing(self) -> dict[str, float]:
+        """Seconds by stage."""
+        return {name: record.seconds for name in self.stages if (record := self.run.record(name)) is not None}
+
+    def artifact(self, name: str, stage: str) -> Any:
+        """A stage's stored result, None if the stage did not run or its result is of another version."""
+        if stage not in self.stages or not self.run.has(name):
+            return None
+        try:
+            return self.run.load(name)
+        except StaleCache:
+            return None
+
+    @cached_property
+    def diagnosis(self) -> dict[str, Any] | None:
+        """Content of diagnosis.json."""
+        if "diagnose" not in self.stages or not self.run.diagnosis.is_file():
+            return None
+        return read_json(self.run.diagnosis)
+
+    @cached_property
+    def detections(self) -> Any:
+        """Index of the images."""
+        return self.artifact("detect", "detect")
+
+    @cached_property
+    def surveys(self) -> dict[str, SurveyResult]:
+        """Surveyed bodies by name."""
+        names = self.result.get("survey", {})
+        found = {name: self.artifact(f"survey_{name}", "survey") for name in names}
+        return {name: result for name, result in found.items() if result is not None}
+
+    @cached_property
+    def station(self) -> StationOrientation | None:
+        """The oriented station."""
+        return self.artifact("orient", "orient")
+
+    @cached_property
+    def points(self) -> MeasuredPoints | None:
+        """Measured points."""
+        return self.artifact("points", "measure")
+
+    @cached_property
+    def frames(self) -> MeasuredFrames | None:
+        """Measured frames."""
+        return self.artifact("frames", "frames")
+
+    @cached_property
+    def identification(self) -> Any:
+        """Result of the stage identify."""
+        return self.artifact("identify", "identify")
+
+    @cached_property
+    def calibrated(self) -> Any:
+        """The calibrated robot with what the diagnosis added."""
+        return self.artifact("calibrated_diagnose", "diagnose") or self.artifact("calibrated_identify", "identify")
+
+    @cached_property
+    def verification(self) -> tuple[Verification, Any] | None:
+        """Verification and the rows of its poses."""
+        return self.artifact("verify", "verify")
+
+    @cached_property
+    def evidence(self) -> Any:
+        """Plots of the diagnosis, as numbers."""
+        return self.artifact("evidence", "diagnose") or ()
+
+    @cached_property
+    def pose_names(self) -> tuple[str, ...]:
+        """Names of the poses; numbers where the campaign is gone."""
+        if self.campaign is not None and self.campaign.poses is not None:
+            return self.campaign.poses.names
+        return ()
+
+    def pose_name(self, row: int) -> str:
+        """Name of a pose."""
+        return self.pose_names[row] if 0 <= row < len(self.pose_names) else f"row {row + 1}"

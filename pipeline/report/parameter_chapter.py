@@ -1,0 +1,119 @@
+"""Chapter: what was identified, how certain it is, and what the data could not tell apart."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from pipeline.report.blocks import Block, Chapter, Table, Text, table
+from pipeline.report.material import Material
+from pipeline.report.style import number
+from robcal.robot.kernel import Kernel
+from robcal.robot.model import RobotModel, parameter_unit
+from robcal.transforms import xyzrpy_from_frame
+
+_UNITS = {"m": ("mm", 1e3), "rad": ("deg", 180 / np.pi), "rad/(N m)": ("deg/kNm", 180e3 / np.pi), "kg": ("kg", 1.0)}
+
+
+def parameter_chapter(material: Material) -> Chapter:
+    """Identified parameters with sigmas, eliminated ones, correlations, condition."""
+    blocks: list[Block] = []
+    calibrated, identification = material.calibrated, material.identification
+    if calibrated is not None:
+        blocks += [_parameters(calibrated), _placements(calibrated.model)]
+        if calibrated.model.terms:
+            blocks.append(_terms(calibrated.model))
+    if identification is not None:
+        blocks += _gauges(identification.facts)
+    return Chapter(
+        "parameters",
+        "Identified parameters",
+        "Deviations from the nominal robot, each with its standard deviation; those beyond three sigma stand out. "
+        "What the data could not tell apart was eliminated, and is named with what it is tied to.",
+        tuple(blocks),
+    )
+
+
+def in_units(model: RobotModel, name: str, value: float) -> tuple[float, str]:
+    """A parameter's value in the unit for people."""
+    inside = parameter_unit(model, name)
+    unit, factor = _UNITS.get(inside, (inside, 1.0))
+    return value * factor, "" if unit == "1" else unit
+
+
+def _parameters(calibrated: Any) -> Table:
+    model = calibrated.model
+    kernel = Kernel(model, calibrated.statics)
+    sigma = np.sqrt(np.clip(np.diag(calibrated.covariance), 0, None))
+    rows = []
+    for name, s in zip(calibrated.names, sigma, strict=True):
+        if name.startswith(("base.", "tool.")):
+            continue
+        theta = float(kernel.theta0[kernel.index[name]])
+        value, unit = in_units(model, name, theta)
+        spread, _ = in_units(model, name, float(s))
+        ratio = abs(theta) / s if s > 0 else float("inf")
+        rows.append([name, number(value, 4), number(spread, 2), unit, f"{ratio:.1f}" if np.isfinite(ratio) else "–",
+                     "●" if ratio > 3 else ""])  # fmt: skip
+    return table(
+        ["Parameter", "Value", "Sigma", "Unit", "Value / sigma", "Significant"], rows,
+        "Elastic parameters in degrees per kN m of static moment. "
+        "Base and tool are given as frames below, their deviations are folded in.", text=(0, 3, 5), emphasis=(1,),
+        shown=80,
+    )  # fmt: skip
+
+
+def _placements(model: RobotModel) -> Table:
+    rows = []
+    for name, frame in (("base in the measuring system", model.world_T_base), ("tool on the flange", model.flange_T_tool)):
+        if frame is None:
+            continue
+        six = xyzrpy_from_frame(np.asarray(frame))
+        rows.append([name, *(f"{v * 1e3:.3f}" for v in six[:3]), *(f"{np.degrees(v):.4f}" for v in six[3:])])
+    return table(["Frame", "x (mm)", "y (mm)", "z (mm)", "roll (deg)", "pitch (deg)", "yaw (deg)"], rows)
+
+
+def _terms(model: RobotModel) -> Table:
+    rows = [
+        [t.name, t.cause or "", f"{t.frame} {t.kind}", t.expression,
+         ", ".join(f"{k} = {number(v, 4)}" for k, v in t.parameters.items())]
+        for t in model.terms
+    ]  # fmt: skip
+    return table(["Term", "Cause", "Added to", "Expression (SI)", "Parameters (SI)"], rows,
+                 "Physics that the diagnosis added to the model.", text=(0, 1, 2, 3, 4))  # fmt: skip
+
+
+def _gauges(facts: Any) -> list[Block]:
+    blocks: list[Block] = []
+    eliminated = facts["eliminated"]
+    rows = []
+    for name, e in sorted(eliminated.items()):
+        ties = sorted(((n, s) for n, s in e.tied_to.items() if abs(s) > 0.05), key=lambda p: -abs(p[1]))
+        rows.append([name, str(e.reason), ", ".join(n for n, _ in ties[:6]) or "–"])
+    sentence = (
+        f"{len(facts['names'])} parameters from {int(facts['used'].sum())} poses, {facts['iterations']} iterations in "
+        f"{facts['seconds']:.2f} s. Condition of the scaled normal equations {number(facts['condition'])} (of the raw "
+        f"ones {number(facts['condition_raw'])}), redundancy {facts['redundancy']}, sigma0 {number(facts['sigma0'])} "
+        f"(one where residuals agree with the stated covariance; p = {number(facts['p_value'], 2)})."
+    )
+    blocks.append(Text(sentence))
+    if rows:
+        blocks.append(
+            table(["Eliminated", "Why", "Tied to (does the same as)"], rows,
+                  "Eliminated parameters stay at their nominal values; nothing is lost within the measured poses.",
+                  text=(0, 1, 2), shown=12)
+        )  # fmt: skip
+    correlation = np.asarray(facts["correlations"])
+    if correlation.ndim == 2 and len(correlation):
+        names = facts["names"]
+        i, j = np.nonzero(np.triu(np.abs(correlation), 1) > 0.95)
+        order = np.argsort(-np.abs(correlation[i, j]))[:30]
+        pairs = [[names[i[k]], names[j[k]], f"{correlation[i[k], j[k]]:+.3f}"] for k in order]
+        if pairs:
+            blocks.append(
+                table(["Parameter", "Hard to tell from", "Correlation"], pairs,
+                      "Correlations above 0.95: their sum or difference is known much better than each.", text=(0, 1),
+                      shown=12)
+            )  # fmt: skip
+    return blocks

@@ -1,0 +1,193 @@
+"""Chapters: the survey's numbers, and all networks in space."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pipeline.report.blocks import Block, Chapter, Figure, Table, Text, table
+from pipeline.report.material import Material
+from pipeline.report.style import ACCENT, AFTER, BEFORE, CATEGORIES, GREEN, GREY, label, number, rounded, scene
+from robcal.photogrammetry.camera import INTRINSIC_NAMES, Camera
+from robcal.photogrammetry.network import CameraNetwork, LengthResult
+from robcal.photogrammetry.station_network import StationOrientation
+from robcal.photogrammetry.survey_types import SurveyResult
+from robcal.transforms import Array, invert
+
+
+def survey_chapter(material: Material) -> Chapter:
+    """Numbers of every surveyed body and of the station's cameras."""
+    blocks: list[Block] = []
+    for name, survey in material.surveys.items():
+        blocks += _survey(name, survey)
+    if material.station is not None:
+        blocks += _station(material.station)
+    return Chapter(
+        "survey",
+        "Survey and cameras",
+        "Bundle adjustments with their own check: known lengths that took no part, redundancy, and correlations.",
+        tuple(blocks),
+    )
+
+
+def _survey(name: str, survey: SurveyResult) -> list[Block]:
+    n = survey.network
+    sigma = np.asarray(n.points_sigma) * 1e3
+    rows = [
+        ["images", str(len(n.image_names)), f"{len(survey.unused_images)} not used"],
+        ["targets", str(len(n.ids)), f"{len(survey.unseen_ids)} listed but not seen, {len(survey.new_ids)} new"],
+        ["marks", str(len(n.marks)), f"{len(n.rejected)} rejected"],
+        ["sigma0", number(n.sigma0), f"{number(n.sigma0_px)} px a coordinate"],
+        ["redundancy", str(n.redundancy_total), f"weakest mark {np.min(n.redundancy):.2f}" if len(n.marks) else ""],
+        ["sigma of a target (mm)", number(np.sqrt(np.mean(sigma**2))), f"largest {number(np.max(sigma))}"],
+        ["datum", n.datum, survey.frame],
+        ["scale", survey.scale, ""],
+        ["engine", survey.engine, f"{n.summary.iterations} iterations"],
+    ]
+    blocks: list[Block] = [table([f"Survey of {name}", "Value", ""], rows, text=(0, 1, 2))]
+    blocks += _lengths([*n.check_lengths, *n.scale_bars])
+    blocks.append(_interior({f"survey of {name}": (n.camera, np.sqrt(np.clip(np.diag(n.intrinsics_covariance), 0, None)))}))
+    if n.correlations:
+        pairs = [[c.first, c.second, f"{c.value:+.3f}"] for c in sorted(n.correlations, key=lambda c: -abs(c.value))]
+        blocks.append(table(["Unknown", "Hard to tell from", "Correlation"], pairs, "Correlations above 0.95.",
+                            text=(0, 1), shown=8))  # fmt: skip
+    if survey.deviations:
+        worst = sorted(survey.deviations, key=lambda d: -d[1])[:5]
+        text = ", ".join(f"{number(d * 1e3)} mm at target {i}" for i, d in worst)
+        blocks.append(Text(f"Given coordinates against surveyed ones after the fit; largest deviations: {text}."))
+    return blocks
+
+
+def _lengths(lengths: list[LengthResult]) -> list[Block]:
+    if not lengths:
+        return []
+    rows = [
+        ["check length" if c.kind == "check" else "scale bar", f"{c.ids[0]} – {c.ids[1]}", f"{c.expected * 1e3:.3f}",
+         f"{c.error * 1e3:+.4f}", number(c.sigma * 1e3, 2), f"{c.w:+.1f}"]
+        for c in lengths
+    ]  # fmt: skip
+    checks = [abs(c.error) * 1e3 for c in lengths if c.kind == "check"]
+    word = (
+        f"Length measurement error E after VDI/VDE 2634-1: {number(max(checks))} mm over {len(checks)} check lengths."
+        if checks
+        else "There are no check lengths: give some to have the scale verified after VDI/VDE 2634-1."
+    )
+    return [table(["Length", "Targets", "Known (mm)", "Error (mm)", "Sigma (mm)", "Error / sigma"], rows, word,
+                  text=(0, 1), shown=20)]  # fmt: skip
+
+
+def _station(station: StationOrientation) -> list[Block]:
+    rows = []
+    for c, name in enumerate(station.names):
+        marks = int(np.sum(station.marks.camera == c))
+        epochs = int(np.sum(station.exterior_camera == c))
+        rows.append([name, str(marks), number(station.noise.get(name)), ", ".join(station.free_interior.get(name, ())) or "–",
+                     "stood still" if epochs == 1 else f"moved {epochs - 1} times"])  # fmt: skip
+    told = (
+        f"Station: {len(station.poses)} poses, redundancy {station.redundancy_total:.0f}, sigma0 {number(station.sigma0)}, "
+        f"residuals {number(station.rms_px)} px RMS."
+    )
+    blocks: list[Block] = [
+        table(["Camera", "Marks", "Scatter / stated", "Refined", "Stand"], rows, told, text=(0, 3, 4))
+    ]
+    sigmas = {name: (camera, np.sqrt(np.clip(np.diag(station.camera_covariance(name)[1]), 0, None)))
+              for name, camera in zip(station.names, station.cameras, strict=True)}  # fmt: skip
+    blocks.append(_interior(sigmas))
+    return blocks
+
+
+def _interior(cameras: dict[str, tuple[Camera, Array]]) -> Table:
+    rows = []
+    for name, (camera, sigma) in cameras.items():
+        values = [float(getattr(camera, n)) for n in INTRINSIC_NAMES]
+        rows.append([name, *(f"{number(v, 6 if k < 4 else 4)} ± {number(s, 2)}" if s > 0 else number(v, 6)
+                             for k, (v, s) in enumerate(zip(values, sigma, strict=True)))])  # fmt: skip
+    return table(["Camera", *(f"{n} (px)" if n in ("fx", "fy", "cx", "cy") else n for n in INTRINSIC_NAMES)], rows,
+                 "Interior orientation with sigmas (OpenCV's convention); without sigma: held.")  # fmt: skip
+
+
+def network_chapter(material: Material) -> Chapter:
+    """Cameras, targets and poses in space."""
+    blocks: list[Block] = [_network(name, s.network) for name, s in material.surveys.items()]
+    frames = material.frames
+    if material.station is not None:
+        blocks.append(_station_scene(material.station, material))
+    elif frames is not None and len(frames.pose):
+        blocks.append(_poses_scene(frames.world_T_body, [material.pose_name(int(p)) for p in frames.pose]))
+    return Chapter("network", "The network in space", "Drag to turn, scroll to come nearer.", tuple(blocks))
+
+
+def _camera_lines(world_T_camera: Array, size: float) -> tuple[list[float | None], ...]:
+    """Outlines of pyramids for cameras (n, 4, 4), in one broken line."""
+    s = size
+    corners = np.array([[-s, -0.75 * s, 1.5 * s], [s, -0.75 * s, 1.5 * s], [s, 0.75 * s, 1.5 * s], [-s, 0.75 * s, 1.5 * s]])
+    path = [None, 0, 1, None, 2, 3, None, 0, 3, 2, 1, 0]
+    out: tuple[list[float | None], ...] = ([], [], [])
+    for T in world_T_camera:
+        tip = T[:3, 3]
+        outline = corners @ T[:3, :3].T + tip
+        for at in path:
+            p = tip if at is None else outline[at]
+            for axis, line in enumerate(out):
+                line.append(float(f"{p[axis]:.5g}"))
+        for line in out:
+            line.append(None)
+    return out
+
+
+def _lines(xyz: tuple[list[float | None], ...], name: str, colour: str, width: int = 2) -> dict[str, object]:
+    return {"type": "scatter3d", "mode": "lines", "x": xyz[0], "y": xyz[1], "z": xyz[2], "name": name,
+            "line": {"color": colour, "width": width}, "hoverinfo": "skip"}  # fmt: skip
+
+
+def _dots(points: Array, text: list[str], name: str, colour: str, size: float = 3) -> dict[str, object]:
+    return {"type": "scatter3d", "mode": "markers", "x": rounded(points[:, 0], 6), "y": rounded(points[:, 1], 6),
+            "z": rounded(points[:, 2], 6), "name": name, "text": [label(t) for t in text],
+            "marker": {"size": size, "color": colour},
+            "hovertemplate": "%{text}<extra>" + label(name) + "</extra>"}  # fmt: skip
+
+
+def _network(name: str, network: CameraNetwork) -> Figure:
+    body_T_camera = invert(network.camera_T_body)
+    extent = float(np.max(np.linalg.norm(network.points - network.points.mean(axis=0), axis=1)))
+    sigma = np.asarray(network.points_sigma) * 1e6
+    sigma = sigma if sigma.ndim == 1 else np.linalg.norm(sigma, axis=1)
+    told = [f"target {i}, sigma {s:.1f} µm" for i, s in zip(network.ids, sigma, strict=True)]
+    data = (
+        _dots(network.points, told, "targets", ACCENT, 4),
+        _lines(_camera_lines(body_T_camera, 0.06 * extent), "cameras", AFTER),
+        _dots(body_T_camera[:, :3, 3], list(network.image_names), "camera positions", AFTER, 2.5),
+    )
+    return Figure(data, scene(), f"Survey of {name}: {len(network.image_names)} photographs of {len(network.ids)} targets.",
+                  "Cameras and targets of the survey in space", height=480)  # fmt: skip
+
+
+def _station_scene(station: StationOrientation, material: Material) -> Figure:
+    centres = station.world_T_body[:, :3, 3]
+    stands = station.world_T_exterior
+    extent = float(np.median(np.linalg.norm(centres - stands[0][:3, 3], axis=1)))
+    data = [
+        _lines(_camera_lines(stands[station.exterior_camera == c], 0.06 * extent), f"camera {name}",
+               CATEGORIES[c % len(CATEGORIES)], 4)
+        for c, name in enumerate(map(label, station.names))
+    ]  # fmt: skip
+    body = station.body.points[station.body.known] if hasattr(station.body, "known") else station.body.points
+    targets = (body @ np.swapaxes(station.world_T_body[:, :3, :3], 1, 2) + centres[:, None]).reshape(-1, 3)
+    data.append(_dots(targets, [""] * len(targets), "targets in all poses", GREY, 1.5))
+    data.append(_dots(centres, [material.pose_name(int(p)) for p in station.poses], "measured poses", GREEN, 3))
+    return Figure(tuple(data), scene(), "The station: cameras, and the body's place in every pose.",
+                  "Station cameras and measured poses in space", height=520)  # fmt: skip
+
+
+def _poses_scene(frames: Array, names: list[str]) -> Figure:
+    centres = frames[:, :3, 3]
+    size = 0.06 * float(np.max(np.ptp(centres, axis=0), initial=1e-3))
+    data = [_dots(centres, names, "measured poses", AFTER, 3)]
+    for k, colour in enumerate((ACCENT, GREEN, BEFORE)):
+        ends = centres + size * frames[:, :3, k]
+        line: tuple[list[float | None], ...] = tuple(
+            [v for a, b in zip(rounded(centres[:, i], 6), rounded(ends[:, i], 6), strict=True) for v in (a, b, None)]
+            for i in range(3)
+        )
+        data.append(_lines(line, f"{'xyz'[k]} axis", colour, 3))
+    return Figure(tuple(data), scene(), "The body's measured poses in the measuring system.",
+                  "Measured poses in space", height=480)  # fmt: skip

@@ -1,0 +1,152 @@
+"""The top of the report: one verdict a person can act on."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pipeline.report.blocks import Grade, KeyFigure, Verdict
+from pipeline.report.material import Material
+from pipeline.report.style import number
+from pipeline.report.verification_chapter import error_table, noise_by_tool
+from robcal.calibration.verification import Verification
+
+LEVEL = 0.01
+"""Probability below which errors are called larger than predicted, or a rest unexplained."""
+MODEST = 1.2
+"""A robot whose errors shrink by less than this factor is not worth loading."""
+
+
+def verdict_of(material: Material) -> Verdict:
+    """Verdict on whatever the run holds: a robot, a station, a survey."""
+    if material.verification is not None:
+        return _robot(material, material.verification[0])
+    if material.surveys or material.station is not None:
+        return _measuring(material)
+    if material.stages:
+        return Verdict("none", "No verdict", "The run holds no verified robot and no survey.", "See the chapters below.",
+                       "Nothing yet.", told_diagnosis(material))  # fmt: skip
+    return Verdict("none", "Nothing done yet", "No stage of this campaign has finished.", "–", "Nothing yet.")
+
+
+def told_diagnosis(material: Material) -> str:
+    """The diagnosis in one sentence, empty without one."""
+    d = material.diagnosis
+    if d is None:
+        return ""
+    text = str(d.get("statement") or "")
+    left = d.get("unexplained") or {}
+    p = left.get("p_value")
+    if p is not None and p < LEVEL:
+        text += f" Something stays unexplained (p = {number(p, 2)}" + (
+            f", {left['pattern']})." if left.get("pattern") else ")."
+        )
+    return text
+
+
+def _robot(material: Material, v: Verification) -> Verdict:
+    noise = noise_by_tool(material)
+    after, before = v.tools["0"], v.nominal["0"] if v.nominal else None
+    gain = before.mean / after.mean if before is not None and after.mean > 0 else float("nan")
+    unexplained = ((material.diagnosis or {}).get("unexplained") or {}).get("p_value")
+    strange = any(c.get("cause") == "unknown" for c in (material.diagnosis or {}).get("causes", []))
+    grade: Grade = "good"
+    doubts = []
+    if v.p_value < LEVEL and v.coverage_95 < 0.9:
+        grade = "care"
+        doubts.append("the errors are larger than their predicted uncertainty")
+    if unexplained is not None and unexplained < LEVEL:
+        grade = "care"
+        doubts.append("the diagnosis finds structure that it cannot explain")
+    if strange:
+        grade = "care"
+        doubts.append("part of the correction is an empirical term without a physical name")
+    if np.isfinite(gain) and gain < MODEST:
+        grade = "bad"
+        doubts = ["calibration does not make this robot better"]
+    word = {"good": "Good", "care": "Usable, with care", "bad": "Not better"}.get(grade, "")
+    change = (
+        f"The robot's mean error falls from {number(before.mean * 1e3)} to {number(after.mean * 1e3)} mm "
+        f"({gain:.{1 if gain < 10 else 0}f} times better), the largest from {number(before.max * 1e3)} to "
+        f"{number(after.max * 1e3)} mm"
+        if before is not None
+        else f"The robot's mean error is {number(after.mean * 1e3)} mm, the largest {number(after.max * 1e3)} mm"
+    )
+    but = f", but {' and '.join(doubts)}" if doubts else ""
+    if grade == "bad":
+        but = ": " + doubts[0]
+    kept = (
+        f"Tested on {v.poses} poses kept out of the identification and of every choice"
+        if v.kind == "verify-set"
+        else f"Cross-validated: each of {v.poses} poses predicted by a robot identified without it"
+    )
+    reason = f"{kept}; {v.coverage_95:.0%} of them lie inside the predicted 95 % region."
+    if "0" in noise:
+        reason += f" The measurement alone scatters by {number(noise['0'] * 1e3)} mm (RMS) at the tool's origin."
+    load = "robot_calibrated.yaml; corrected targets or joint angles by 'pipeline compensate', controller code by 'pipeline export'."
+    if grade == "bad":
+        load = "Keep the nominal robot until the doubts are settled."
+    return Verdict(
+        grade, word, f"{change}{but}.", reason, load, told_diagnosis(material), _keys(material, v, noise, gain),
+        error_table(v, noise, full=False),
+    )  # fmt: skip
+
+
+def _keys(material: Material, v: Verification, noise: dict[str, float], gain: float) -> tuple[KeyFigure, ...]:
+    after, before = v.tools["0"], v.nominal["0"] if v.nominal else None
+    keys = [
+        KeyFigure(number(after.mean * 1e3), "mm", "Mean error after calibration",
+                  f"before {number(before.mean * 1e3)} mm" if before else ""),
+        KeyFigure(number(after.max * 1e3), "mm", "Largest error after",
+                  f"before {number(before.max * 1e3)} mm" if before else ""),
+    ]  # fmt: skip
+    if np.isfinite(gain):
+        keys.append(KeyFigure(f"{gain:.1f}", "times", "Improvement", f"over {v.poses} poses"))
+    if "0" in noise:
+        keys.append(KeyFigure(number(noise["0"] * 1e3), "mm", "Noise of the measurement", "RMS of a measured pose"))
+    if v.iso is not None:
+        keys.append(KeyFigure(number(v.iso.ap_mean * 1e3), "mm", "AP, ISO 9283",
+                              f"largest {number(v.iso.ap_max * 1e3)} mm, {v.iso.groups} poses"))  # fmt: skip
+    return tuple(keys)
+
+
+def _measuring(material: Material) -> Verdict:
+    grade: Grade = "good"
+    parts, reasons, keys = [], [], []
+    for name, survey in material.surveys.items():
+        n = survey.network
+        sigma = float(np.sqrt(np.mean(n.points_sigma**2)) * 1e3)
+        parts.append(f"{len(n.ids)} targets of {name} are known to {number(sigma)} mm from {len(n.image_names)} images")
+        keys += [
+            KeyFigure(number(sigma), "mm", f"Sigma of a coordinate, {name}", f"{len(n.ids)} targets"),
+            KeyFigure(number(n.sigma0_px), "px", "Sigma0 of a mark", f"redundancy {n.redundancy_total}"),
+        ]
+        if n.check_lengths:
+            worst = max(n.check_lengths, key=lambda c: abs(c.error))
+            keys.append(KeyFigure(number(abs(worst.error) * 1e3), "mm", "Length error, VDI/VDE 2634-1",
+                                  f"largest of {len(n.check_lengths)} check lengths"))  # fmt: skip
+            reasons.append(f"{len(n.check_lengths)} check lengths took no part in the adjustment")
+            if any(abs(c.w) > 3.3 for c in n.check_lengths):
+                grade = "care"
+                parts.append("but check lengths deviate by more than their sigma allows")
+        else:
+            reasons.append(f"redundancy {n.redundancy_total}; no check length tests the scale of {name}")
+    station = material.station
+    if station is not None:
+        parts.append(f"{len(station.names)} cameras are oriented from {len(station.poses)} poses")
+        keys.append(KeyFigure(number(station.rms_px), "px", "Residuals of the station", "RMS"))
+        reasons.append(f"redundancy {station.redundancy_total:.0f} of the station, sigma0 {number(station.sigma0)}")
+        if not station.converged:
+            grade = "bad"
+            parts.append("but the station's adjustment did not converge")
+    diagnosis = material.diagnosis or {}
+    left = (diagnosis.get("unexplained") or {}).get("p_value")
+    if (left is not None and left < LEVEL) or any(c.get("cause") == "unknown" for c in diagnosis.get("causes", [])):
+        grade = "care" if grade == "good" else grade
+        parts.append("but the images show something that the camera model does not explain")
+    sentence = "; ".join(parts)
+    word = {"good": "Good", "care": "Usable, with care", "bad": "Not usable"}.get(grade, "")
+    return Verdict(
+        grade, word, f"{sentence[:1].upper()}{sentence[1:]}.", f"{'; '.join(reasons)}.",
+        "bodies/*.yaml (surveyed coordinates with sigmas) and cameras/*.yaml (calibrated cameras).",
+        told_diagnosis(material), tuple(keys),
+    )  # fmt: skip
