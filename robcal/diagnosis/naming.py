@@ -62,7 +62,10 @@ def posterior(families: Sequence[Family], result: ScanResult) -> Posterior:
 
 
 def refine(family: Family, constants: Constants, at: Tangents, fitted: Array, residual: Array) -> Constants:
-    """Continuous constants moved from their grid point to the best fit of the linearised problem."""
+    """Constants moved from their grid point to the best fit of the linearised problem: between the grid's values for
+    continuous ones, among the neighbours for those of which the grid holds a part only."""
+    for name, values in family.ordered.items():
+        constants = _nearby(family, constants, name, values, at, fitted, residual)
     if not family.continuous:
         return constants
     names = [name for name in family.continuous if np.isfinite(constants[name])]
@@ -94,6 +97,30 @@ def refine(family: Family, constants: Constants, at: Tangents, fitted: Array, re
         low, high = family.continuous[name]
         refined[name] = float(np.clip(value if low <= 0 else np.exp(value), low, high))
     return refined
+
+
+def _nearby(
+    family: Family,
+    constants: Constants,
+    name: str,
+    values: Sequence[float],
+    at: Tangents,
+    fitted: Array,
+    residual: Array,
+) -> Constants:
+    tried = sorted(point[name] for point in family.grid)
+    here = tried.index(constants[name])
+    low, high = tried[max(here - 1, 0)], tried[min(here + 1, len(tried) - 1)]
+    trials = [dict(constants) | {name: v} for v in values if low < v < high]
+    if len(tried) == len(values) or len(trials) < 2:
+        return constants
+    listed = [Entry(0, g, at.columns(family, trial) * family.sizes(trial)) for g, trial in enumerate(trials)]
+    best, chosen = -np.inf, constants
+    for stack in stack_entries(listed, fitted):
+        evidence = log_bayes_factor(stack.singular, np.einsum("emc,m->ec", stack.basis, residual))
+        if float(evidence.max()) > best:
+            best, chosen = float(evidence.max()), trials[int(stack.grid[int(np.argmax(evidence))])]
+    return chosen
 
 
 def signature(columns: Array, values: Array, fitted: Array) -> Array:

@@ -36,7 +36,8 @@ class AdjustSettings:
     Attributes
     ----------
     robust : start with Huber weights, limit ``huber`` (standard deviations of a residual vector).
-    snooping : take out marks whose residual is significant on the family-wise level ``snooping_level``.
+    snooping : take out marks whose residual is significant on the family-wise level ``snooping_level``; it is small
+        because the tails of real marks are heavier than normal ones, and what lies in them does no harm.
     variance_components : estimate how far the marks (per group) and, from five redundant ones on, the scale bars
         scatter more or less than stated; otherwise the stated covariances are believed.
     undetermined : 'leave_out' holds intrinsics that the data do not determine at their start values and says so,
@@ -48,7 +49,7 @@ class AdjustSettings:
     robust: bool = True
     huber: float = 2.5
     snooping: bool = True
-    snooping_level: float = 0.01
+    snooping_level: float = 1e-5
     variance_components: bool = True
     undetermined: Literal["leave_out", "raise"] = "leave_out"
     hold_focal: bool = False

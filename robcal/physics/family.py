@@ -49,6 +49,7 @@ class Family:
     sentence : template for people, filled with the reported parameters, `where` and `direction`.
     grid : values of the constants to be tried.
     continuous : constants that may be refined, with their bounds.
+    ordered : constants with a long list of values of which the grid holds a part; refined among the values nearby.
     weight : prior weight of the whole family (a cause that may act at many places shares one weight among them).
     bases : robot families: constants to the expressions.
     frees : robot families: parameters the kernel has already, which the cause sets free (order of `parameters`).
@@ -65,6 +66,7 @@ class Family:
     sentence: str
     grid: tuple[Constants, ...] = ({},)
     continuous: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    ordered: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     weight: float = 1.0
     bases: Callable[[Constants], tuple[Basis, ...]] | None = None
     frees: tuple[str, ...] = ()

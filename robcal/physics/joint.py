@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from robcal.physics.family import PER_KNM, Array, Basis, Constants, Family
-from robcal.physics.site import Joint, RobotSite, exponential_law
+from robcal.physics.site import Joint, RobotSite, breaks, exponential_law
 
 TORQUE_SCALES_NM = (5.0, 15.0, 50.0, 150.0, 500.0)
 THRESHOLDS_NM = (0.5, 5.0, 20.0, 80.0)
@@ -164,7 +164,7 @@ def _lost_motion(site: RobotSite, joint: Joint) -> Iterator[Family]:
 
 
 def _zero_jump(site: RobotSite, joint: Joint) -> Iterator[Family]:
-    order = np.sort(site.variables["index"])
+    first, every = breaks(site.variables["index"], 2)
     name = f"jump_{joint.unit}"
     yield Family(
         "zero_jump",
@@ -175,7 +175,8 @@ def _zero_jump(site: RobotSite, joint: Joint) -> Iterator[Family]:
         (5e-4,),
         lambda v, c: {"pose": c["pose"], name: float(v[0]) * joint.factor},
         "The zero of {where} jumped by {" + name + ":.4f} " + joint.unit + " at pose {pose}",
-        grid=tuple({"pose": float(i)} for i in order[2:-1]),
+        grid=tuple({"pose": i} for i in first),
+        ordered={"pose": every},
         bases=lambda c: (Basis(joint.frame, "q", f"step(index - {c['pose'] - 0.5!r})", "jump"),),
         covariates=("index",),
     )

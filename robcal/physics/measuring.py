@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from robcal.physics.family import DEG, Array, Constants, Family, ObservationData
+from robcal.physics.site import breaks
 
 STEEL_WIRE_N = 5.0
 """Tension that a draw-wire encoder typically keeps up (makers' data sheets: 2 to 10 N); sag scales with its inverse."""
@@ -116,7 +117,10 @@ def _station(data: ObservationData) -> Iterator[Family]:
             continuous={"tau_h": (0.02 * duration, 10.0 * duration)},
             displace=lambda d, c: _world(d, _positions(d)[:, :, None] * course(d, c["tau_h"])),
         )
-    order = np.sort(data.variables["index"])
+    if data.kind == "points":
+        yield from (_bent_sight(data, axis) for axis in range(3))
+        yield replace(_refraction(data), weight=0.25)
+    first, every = breaks(data.variables["index"], 3)
 
     def moved(d: ObservationData, c: Constants) -> Array:
         # the station moved by (shift, turn) about its origin, so everything it measures moves the other way
@@ -139,10 +143,70 @@ def _station(data: ObservationData) -> Iterator[Family]:
             "turn_deg": [float(x) * DEG for x in v[3:]],
         },
         "The station moved before pose {pose}",
-        grid=tuple({"pose": float(i)} for i in order[3:-3]),
+        grid=tuple({"pose": i} for i in first),
+        ordered={"pose": every},
         displace=moved,
         covariates=("index",),
     )
+
+
+def _bent_sight(data: ObservationData, axis: int) -> Family:
+    """Light bends evenly across the line of sight: points move by curvature * distance^2 / 2 along one axis.
+
+    The distance is from where the instrument stands, which is not known: its place enters by the linear part.
+    """
+    centre = data.p_world.mean(axis=0)
+
+    def bent(d: ObservationData, c: Constants) -> Array:
+        arm = d.p_world - centre
+        out = np.zeros((len(arm), 3, 4))
+        out[:, axis, 0] = 0.5 * np.sum(arm**2, axis=1)
+        out[:, axis, 1:] = arm
+        return out
+
+    names = ("curvature", "x", "y", "z")
+    letter = "xyz"[axis]
+
+    def report(v: Array, c: Constants) -> dict[str, object]:
+        middle = ", ".join(f"{m:.3f}" for m in centre)
+        law = f"d{letter} = {v[0]:.4g} |p - c|^2 / 2 + ({v[1]:.4g}, {v[2]:.4g}, {v[3]:.4g}) (p - c), c = ({middle}) m"
+        return {
+            "curvature_per_km": 1e3 * float(v[0]),
+            "term": {"variables": ["x_m", "y_m", "z_m"], "kind": "formula", "formula": law},
+        }
+
+    return Family(
+        "refraction", "camera", "station", letter, names, (2e-5, 5e-5, 5e-5, 5e-5), report,
+        "The lines of sight of the station bend along {direction} (refraction), {curvature_per_km:.4f} per km",
+        displace=bent, weight=0.25,
+    )  # fmt: skip
+
+
+def _refraction(data: ObservationData) -> Family:
+    """A line of sight that bends (a temperature gradient, a window) warps space smoothly: a quadratic field.
+
+    Rigid motion and scale are left to their own causes; the field is centred on the measured volume and given per
+    metre squared. Which physics bends the rays cannot be told from points alone.
+    """
+    centre = data.p_world.mean(axis=0)
+
+    def bent(d: ObservationData, c: Constants) -> Array:
+        x, y, z = (d.p_world - centre).T
+        squares = np.stack([x * x, y * y, z * z, x * y, x * z, y * z], axis=1)
+        return np.einsum("mq,ij->miqj", squares, np.eye(3)).reshape(len(x), 3, -1)
+
+    names = tuple(f"{s}_{a}" for s in ("xx", "yy", "zz", "xy", "xz", "yz") for a in "xyz")
+
+    def report(v: Array, c: Constants) -> dict[str, object]:
+        terms = [f"{1e3 * value:.4g} mm * {name[:2]} along {name[3]}" for name, value in zip(names, v, strict=True)]
+        middle = ", ".join(f"{m:.3f}" for m in centre)
+        return {"term": {"variables": ["x_m", "y_m", "z_m"], "kind": "formula",
+                         "formula": f"about ({middle}) m: " + " + ".join(terms)}}  # fmt: skip
+
+    return Family(
+        "refraction", "camera", "station", None, names, (1e-4,) * len(names), report,
+        "The lines of sight of the station are bent (refraction): the measured space is warped", displace=bent,
+    )  # fmt: skip
 
 
 def _cross_columns(arm: Array) -> Array:

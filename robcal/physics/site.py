@@ -95,23 +95,17 @@ class RobotSite:
         return 0.0 if times is None else float(np.max(times) - np.min(times)) / 3600.0
 
 
-def time_laws(site: RobotSite) -> list[tuple[str, dict[str, float], str]]:
-    """Covariates of thermal effects: (expression, constants, unit tag 'K' or 'h').
+MOST_BREAKS = 100
+"""Poses at which a break is tried first; with longer recordings the best one is refined among its neighbours."""
 
-    Time-only effects follow 1 - exp(-t/tau); the expression has the value t_end in hours at the end, so that its
-    coefficient is the total change by the duration.
-    """
-    laws: list[tuple[str, dict[str, float], str]] = []
-    for name in site.temperatures():
-        first = float(site.variables[name][int(np.argmin(site.variables["index"]))])
-        laws.append((f"({name} - {first!r})", {}, name))
-    duration = site.duration_h()
-    if duration > 0:
-        start = float(np.min(site.variables["time_s"]))
-        for share in (0.1, 0.2, 0.4, 0.8, 2.0):
-            laws.append((exponential_law(start, duration, share * duration), {"tau_h": share * duration}, "h"))
-        laws.append((f"((time_s - {start!r})/3600)", {"tau_h": np.inf}, "h"))
-    return laws
+
+def breaks(index: Array, margin: int, most: int = MOST_BREAKS) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Values of `index` at which something may break: those to be tried first, and all of them."""
+    every = tuple(float(i) for i in np.sort(index)[margin:-margin])
+    if len(every) <= most:
+        return every, every
+    chosen = np.unique(np.linspace(0, len(every) - 1, most).round().astype(int))
+    return tuple(every[i] for i in chosen), every
 
 
 def exponential_law(start_s: float, duration_h: float, tau_h: float) -> str:

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from robcal.physics.family import DEG, PER_KNM, Array, Basis, Constants, Family, Report
-from robcal.physics.site import LETTER_OF_KIND, Joint, RobotSite, exponential_law
+from robcal.physics.site import LETTER_OF_KIND, Joint, RobotSite, breaks, exponential_law
 from robcal.robot.terms import identifier
 
 
@@ -173,7 +173,7 @@ def _base(site: RobotSite) -> Iterator[Family]:
             ),
             covariates=("base_mx", "base_my"),
         )
-    order = np.sort(site.variables["index"])
+    first, every = breaks(site.variables["index"], 3)
     kinds = ("x", "y", "z", "roll", "pitch", "yaw")
     yield Family(
         "base_moved",
@@ -188,7 +188,8 @@ def _base(site: RobotSite) -> Iterator[Family]:
             "turn_deg": [float(x) * DEG for x in v[3:]],
         },
         "The base of the robot moved before pose {pose}",
-        grid=tuple({"pose": float(i)} for i in order[3:-3]),
+        grid=tuple({"pose": i} for i in first),
+        ordered={"pose": every},
         bases=lambda c: tuple(Basis("base", kind, f"step(index - {c['pose'] - 0.5!r})", kind) for kind in kinds),
         covariates=("index",),
     )
