@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robcal.errors import InvalidInput
-from robcal.imaging.edge_model import blurred_ellipse, matrix_from_axes
+from robcal.imaging.edge_model import blurred_ellipse, matrix_from_axes, spot
 from robcal.imaging.noise import NoiseModel
 
 Array = NDArray[np.float64]
@@ -38,11 +38,19 @@ def centre_bound(
     s = float(np.sqrt(blur**2 + 1.0 / 12.0))
     half = int(np.ceil(max(semi_axes) + 6.0 * s + 2.0))
     grid = np.arange(-half, half + 1.0)
-    x, y = np.meshgrid(grid, grid)
-    b = matrix_from_axes(np.array([semi_axes], dtype=float), np.array([angle]))
-    shape = np.concatenate([[phase], b, [[np.log(s)]]], axis=1)
-    profile, by_shape = blurred_ellipse(shape, x.reshape(1, -1), y.reshape(1, -1))
+    x, y = (array.reshape(1, -1) for array in np.meshgrid(grid, grid))
+    axes, turn = np.array([semi_axes], dtype=float), np.array([angle])
+    small = min(semi_axes) < 2.0 * s
+    if small:
+        # the light of the disc in a Gaussian spot of the same second moments (a quarter of the squared semi-axes)
+        second = np.sqrt(s**2 + axes**2 / 4.0)
+        contrast = contrast * float(np.prod(axes) / (2.0 * np.prod(second)))
+        axes = second
+    shape = np.concatenate([[phase], matrix_from_axes(axes, turn), [[np.log(s)]]], axis=1)
+    profile, by_shape = spot(shape, x, y) if small else blurred_ellipse(shape, x, y)
     columns = by_shape[0] * contrast
+    if small:
+        columns = columns[:, :5]  # size and blur are one
     everything = np.column_stack([columns, profile[0], np.ones(profile.shape[1])])
     columns = columns[:, :2] if known_shape else everything
     weight = 1.0 / noise.at(background + contrast * profile[0])

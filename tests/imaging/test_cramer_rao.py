@@ -9,7 +9,7 @@ from robcal.imaging.noise import NoiseModel
 from tests.imaging.rendering import Dot, render
 
 
-@pytest.mark.parametrize(("a", "b", "angle"), [(3.0, 3.0, 0.0), (6.0, 3.5, 0.7), (12.0, 9.0, 2.0)])
+@pytest.mark.parametrize(("a", "b", "angle"), [(1.0, 1.0, 0.0), (1.5, 0.8, 0.5), (3.0, 3.0, 0.0), (6.0, 3.5, 0.7), (12.0, 9.0, 2.0)])
 def test_bound_agrees_with_brute_force(a: float, b: float, angle: float) -> None:
     noise = NoiseModel(2.0, 0.04, 15.0)
     contrast, background, blur, size = 150.0, 15.0, 0.8, int(2 * a + 16)
@@ -23,7 +23,7 @@ def test_bound_agrees_with_brute_force(a: float, b: float, angle: float) -> None
     jacobian = np.column_stack([grey(h, 0) - grey(-h, 0), grey(0, h) - grey(0, -h)]) / (2 * h)
     fisher = (jacobian / noise.at(grey(0, 0))[:, None]).T @ jacobian
     bound = centre_bound((a, b), angle, blur, contrast, background, noise, known_shape=True)
-    np.testing.assert_allclose(bound, np.linalg.inv(fisher), rtol=0.06, atol=0.03 * np.trace(bound))
+    np.testing.assert_allclose(bound, np.linalg.inv(fisher), rtol=0.08, atol=0.04 * np.trace(bound))
 
 
 def test_unknown_shape_costs_nothing_for_the_centre_of_a_symmetric_dot() -> None:
