@@ -21,6 +21,7 @@ from robcal.errors import InvalidInput
 from robcal.photogrammetry.bodies import Body
 from robcal.photogrammetry.measure_frames import MeasuredFrames
 from robcal.photogrammetry.measured_points import MeasuredPoints
+from robcal.photogrammetry.shared_errors import unabsorbed_covariance
 from robcal.transforms import Array
 
 Rows = NDArray[np.int64]
@@ -74,7 +75,7 @@ def build_recording(campaign: Campaign, run: Run, body: Body | None) -> RobotRec
         points: MeasuredPoints = run.load("points")
         stated &= points.covariance is not None
         if len(frames.pose):
-            observations.append(frame_observations(frames))
+            observations.append(frame_observations(points, frames))
             # Points of the own station share the errors of its cameras and of the surveyed body, which repeat in every
             # pose: what they tell about targets and cameras is judged where these are adjusted, with their covariance.
             own_station = points.station_jacobian is not None
@@ -93,9 +94,11 @@ def build_recording(campaign: Campaign, run: Run, body: Body | None) -> RobotRec
     return RobotRecording(tuple(observations), tuple(detailed), stated, tuple(notes))
 
 
-def frame_observations(frames: MeasuredFrames) -> FrameObservations:
-    """Measured frames as observations."""
-    return FrameObservations(frames.pose, frames.world_T_body, frames.covariance)
+def frame_observations(points: MeasuredPoints, frames: MeasuredFrames) -> FrameObservations:
+    """Measured frames as observations: their noise, and what station and body add that no base or tool absorbs."""
+    return FrameObservations(
+        frames.pose, frames.world_T_body, frames.covariance + unabsorbed_covariance(points, frames)
+    )
 
 
 def _used_points(points: MeasuredPoints, frames: MeasuredFrames, body: Body | None) -> PointObservations | None:
