@@ -41,7 +41,7 @@ class SelectionSettings:
     """
 
     level: float = 0.01
-    most: int = 6
+    most: int = 8
     blunder_log_p: float = float(np.log(1e-3))
     blunder_share: float = 0.1
     runs: int = 400
