@@ -16,6 +16,7 @@ from pipeline.image_findings import images_of
 from pipeline.poses_table import Poses
 from pipeline.runs import write_json
 from pipeline.stages.base import Context, Outcome, Stage, no_files
+from pipeline.stages.evidence import evidence_of
 from pipeline.stages.identify import load_identification, require_robot
 from pipeline.stages.observations import RobotRecording, Rows
 from pipeline.tables import write_table
@@ -106,6 +107,7 @@ def work(context: Context) -> Outcome:
             diagnosed=True,
         )
     outputs.append(run.save(f"calibrated_{NAME}", calibrated))
+    outputs.append(run.save("evidence", evidence_of(found.model, recording, found.names, verify, diagnosis)))
     told = [f.statement for f in images.findings] + [f.statement for f in diagnosis.findings]
     notes = told or ["nothing missing: the model explains the data"]
     result = _result(diagnosis) | {"mismatch": content["mismatch"]}
@@ -172,5 +174,6 @@ STAGE = Stage(
     inputs=no_files,
     settings=lambda campaign: campaign.entry.diagnosis.model_dump(),
     after=("survey", "orient", "identify"),
-    code=("robcal/diagnosis", "robcal/physics", "pipeline/stages/diagnose.py", "pipeline/image_findings.py"),
+    code=("robcal/diagnosis", "robcal/physics", "pipeline/stages/diagnose.py", "pipeline/stages/evidence.py",
+          "pipeline/image_findings.py"),
 )
