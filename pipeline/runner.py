@@ -143,8 +143,10 @@ def _run_stages(context: Context, until: str | None, start: str | None, only: Se
             skipped.append(stage.name)
             messages.info(f"{stage.name}: up to date")
             continue
+        before = run.record(stage.name)
         run.forget(stage.name)
         _run_stage(stage, key, context)
+        run.remove_stale(before, run.record(stage.name))
         ran.append(stage.name)
         run.write_result(collect_result(run, campaign, names))
     result = collect_result(run, campaign, names)

@@ -176,6 +176,18 @@ class Run:
         except OSError as error:
             raise storage_error(self.record_path(stage), error) from None
 
+    def remove_stale(self, before: StageRecord | None, after: StageRecord | None) -> None:
+        """Remove what an earlier run of a stage wrote and the present one did not."""
+        if before is None or after is None:
+            return
+        for name in set(before.outputs) - set(after.outputs):
+            path = (self.folder / name).resolve()
+            try:
+                if path.is_relative_to(self.folder.resolve()):
+                    path.unlink(missing_ok=True)
+            except OSError as error:
+                raise storage_error(path, error) from None
+
     def up_to_date(self, stage: str, key: str) -> bool:
         """Whether the stage ran with this key and its outputs are still what it wrote."""
         record = self.record(stage)

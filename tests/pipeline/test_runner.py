@@ -11,7 +11,7 @@ import pytest
 
 from pipeline import codec, files, runner
 from pipeline.runner import STAGE_NAMES, run_campaign
-from pipeline.runs import Run, RunLocked
+from pipeline.runs import Run, RunLocked, StageRecord
 from pipeline.stages.base import Context, Outcome, Stage
 from pipeline.stages.registry import STAGES
 from robcal.errors import InvalidInput
@@ -56,6 +56,15 @@ def test_from_runs_again_and_a_deleted_result_is_made_again(point_campaign: Path
     (out / "frames.csv").unlink()
     assert "frames" in run_campaign(point_campaign, out, until="verify").ran
     assert results(out) == before
+
+
+def test_what_a_stage_no_longer_writes_is_removed(tmp_path: Path) -> None:
+    run = Run(tmp_path)
+    for name in ("old.csv", "kept.csv"):
+        (tmp_path / name).write_text("x")
+    before = StageRecord("s", "k", {"old.csv": "h", "kept.csv": "h", "../outside": "h"}, {})
+    run.remove_stale(before, StageRecord("s", "k2", {"kept.csv": "h"}, {}))
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["kept.csv"]
 
 
 def test_the_campaign_is_never_written_to(point_campaign: Path, tmp_path: Path) -> None:
