@@ -12,11 +12,11 @@ from robcal.diagnosis.heldout import cross_validated, folds, noise_floor, positi
 from robcal.diagnosis.naming import rivals, signature
 from robcal.diagnosis.next_poses import separating_poses
 from robcal.diagnosis.noise import Noise, estimate_noise
-from robcal.diagnosis.recording import Accepted, Fit, Recording, fit, observation_data
+from robcal.diagnosis.recording import Accepted, Fit, Recording, fit, observation_data, pseudo_covariance
 from robcal.diagnosis.result import Diagnosis, Finding, Rival
 from robcal.diagnosis.selection import Selection, SelectionSettings, poses_that_carry, select
 from robcal.diagnosis.swaps import find_swaps, relabelled
-from robcal.physics.family import ObservationData, numeric_sigma
+from robcal.physics.family import Array, ObservationData, numeric_sigma
 from robcal.physics.measuring import describe, swapped
 from robcal.robot.model import RobotModel
 
@@ -164,6 +164,24 @@ def _findings(
     return tuple(findings)
 
 
+def _covariance(look: Analysis, item: Accepted) -> Array:
+    """Covariance of the amplitudes; the uncertainty of constants that were refined along with them included."""
+    family = item.family
+    bent = [name for name in family.continuous if np.isfinite(item.constants.get(name, np.inf))]
+    if not bent:
+        return item.covariance
+    columns = [look.at.columns(family, item.constants)]
+    for name in bent:
+        low, high = family.continuous[name]
+        step = 1e-3 * (abs(item.constants[name]) if low > 0 else high - low)
+        ends = [dict(item.constants) | {name: item.constants[name] + side * step} for side in (1.0, -1.0)]
+        ahead, behind = (look.at.columns(family, end) @ item.values for end in ends)
+        columns.append(((ahead - behind) / (2.0 * step))[:, None])
+    together = np.column_stack(columns)
+    count = len(item.values)
+    return pseudo_covariance(together - look.basis @ (look.basis.T @ together))[:count, :count]
+
+
 def _finding(
     look: Analysis, item: Accepted, p_value: float, heldout: tuple[float, float], chosen: Selection
 ) -> Finding:
@@ -179,7 +197,7 @@ def _finding(
         if family.cause != "unknown":
             others = rivals(look.families, named, look.ranked, look.stacks, projected, look.named)
     factor = look.result.variance_factor
-    covariance = item.covariance * factor
+    covariance = _covariance(look, item) * factor
     told, sigma = numeric_sigma(family.report, item.values, item.constants, covariance)
     excess = float(look.residual @ look.residual) - factor * look.result.redundancy
     explained = float(np.clip(projected @ look.residual / max(excess, 1e-300), 0.0, 1.0))

@@ -338,9 +338,13 @@ def solve(jacobian: Array, residual: Array) -> Array:
 
 
 def pseudo_covariance(jacobian: Array) -> Array:
-    """Pseudo-inverse of the normal matrix, columns scaled; directions without information get no variance."""
+    """Pseudo-inverse of the normal matrix, columns scaled; directions without information get no variance.
+
+    By singular values of the Jacobian, since those of the normal matrix drown in rounding at the square of its range.
+    """
     size = np.linalg.norm(jacobian, axis=0)
     safe = np.where(size > 0, size, 1.0)
-    scaled = jacobian / safe
-    inverse = np.linalg.pinv(scaled.T @ scaled, rcond=1e-18, hermitian=True)
-    return inverse / np.outer(safe, safe)
+    _, singular, right = np.linalg.svd(jacobian / safe, full_matrices=False)
+    seen = singular > 1e-8 * singular.max(initial=0.0)
+    root = (right[seen].T / singular[seen]) / safe[:, None]
+    return root @ root.T
