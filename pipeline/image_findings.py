@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
+from pipeline.bodies import surveyed_or_given
 from pipeline.campaign import Campaign
 from pipeline.runs import Run
-from robcal.diagnosis.image_data import station_data, survey_data
+from robcal.diagnosis.image_data import survey_data
 from robcal.diagnosis.image_diagnosis import ImageDiagnosis, ImageFinding, diagnose_images
+from robcal.diagnosis.image_station import given_points, station_data
 from robcal.diagnosis.lens_findings import station_findings, survey_findings
 from robcal.photogrammetry.station_network import StationOrientation
 from robcal.photogrammetry.survey_types import SurveyResult
+from robcal.transforms import Array
 
 
 @dataclass(frozen=True)
@@ -37,14 +42,29 @@ def images_of(campaign: Campaign, run: Run) -> ImageFindings:
             path = source.survey.start_path
             camera = path.stem if path is not None else f"survey_{name}"
             findings += survey_findings(result.network, start.camera if start else None, camera)
-            scans.append(diagnose_images(survey_data(result.network, None, camera)))
+            dots = any(target.code != "corner" for target in source.file.targets)
+            scans.append(diagnose_images(survey_data(result.network, None, camera, name, dots=dots)))
             noise.append(result.network.sigma0)
     if run.record("orient") is not None and run.has("orient"):
         orientation: StationOrientation = run.load("orient")
         names: Sequence[str] = campaign.poses.names if campaign.poses is not None else ()
-        findings += station_findings(orientation, tuple(names))
-        scans.append(diagnose_images(station_data(orientation, tuple(names))))
+        given = surveyed_or_given(campaign, run, orientation.body.name)
+        start = {camera: s.start.camera if s.start else None for camera, s in campaign.cameras.items()}
+        data = station_data(orientation, tuple(names), given, start, _covariates(campaign))
+        findings += station_findings(orientation, tuple(names), given_points(orientation, given), data.inflation)
+        scans.append(diagnose_images(data))
         noise.append(orientation.sigma0)
     for scan in scans:
         findings += scan.findings
     return ImageFindings(tuple(findings), tuple(scans), max(noise))
+
+
+def _covariates(campaign: Campaign) -> Mapping[str, Array]:
+    """Temperatures and hours of all poses."""
+    if campaign.poses is None:
+        return {}
+    given = campaign.poses.covariates
+    found = {name: np.asarray(v, dtype=float) for name, v in given.items() if name.startswith("temp_")}
+    if "time_s" in given:
+        found["hours"] = np.asarray(given["time_s"], dtype=float) / 3600.0
+    return found

@@ -5,39 +5,20 @@ Each gives the displacement (m, 2, q) in px of all marks per unit of its paramet
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator
 
 import numpy as np
 
+from robcal.diagnosis.image_cause import ImageCause, only
 from robcal.diagnosis.image_data import ImageData
+from robcal.diagnosis.image_refraction import refraction_causes
 from robcal.photogrammetry.camera import project_with_jacobians
 from robcal.photogrammetry.eccentricity import centre_shift
 from robcal.physics.family import Array
 
 DEG = float(np.degrees(1.0))
 FIELD_DEGREE = 5
-
-
-@dataclass(frozen=True)
-class ImageCause:
-    """A candidate: where it acts, its columns, the typical size of its parameters, and how they are told.
-
-    `plausible` refuses estimates that physics forbids; `least_gain` is the share by which the prediction of marks must
-    improve for the cause to be worth a name.
-    """
-
-    cause: str
-    stage: str
-    where: str
-    direction: str | None
-    columns: Array
-    sizes: Array
-    report: Callable[[Array], dict[str, object]]
-    sentence: str
-    weight: float = 1.0
-    plausible: Callable[[Array], bool] = lambda values: True
-    least_gain: float = 0.003
+MOST_CHANGE_POINTS = 40
 
 
 def image_causes(data: ImageData, moves: bool = True) -> Iterator[ImageCause]:
@@ -46,17 +27,14 @@ def image_causes(data: ImageData, moves: bool = True) -> Iterator[ImageCause]:
         rows = data.camera == c
         if np.any(rows):
             yield from _lens(data, c, name, rows)
-            yield from _refraction(data, c, name, rows)
+            yield from refraction_causes(data, c, name, rows)
             yield from _eccentricity(data, c, name, rows)
             yield _field(data, c, name, rows)
             if moves and data.by_exterior is not None:
                 yield from _moves(data, name, rows)
     if data.by_target is not None:
         yield from _targets(data, data.by_target)
-
-
-def _only(rows: Array, values: Array) -> Array:
-    return np.where(rows[:, None, None], values, 0.0)
+        yield from _growth(data, data.by_target)
 
 
 def _lens(data: ImageData, c: int, name: str, rows: Array) -> Iterator[ImageCause]:
@@ -70,7 +48,7 @@ def _lens(data: ImageData, c: int, name: str, rows: Array) -> Iterator[ImageCaus
             "camera",
             name,
             None,
-            _only(rows, by[:, :, radial]),
+            only(rows, by[:, :, radial]),
             np.array([0.1, 0.1, 0.1]),
             lambda v: {labels[i]: float(x) for i, x in zip(radial, v, strict=True)},
             "The lens of camera {where} has radial distortion that its file leaves out",
@@ -81,7 +59,7 @@ def _lens(data: ImageData, c: int, name: str, rows: Array) -> Iterator[ImageCaus
             "camera",
             name,
             None,
-            _only(rows, by[:, :, 6:8]),
+            only(rows, by[:, :, 6:8]),
             np.array([1e-3, 1e-3]),
             lambda v: {"p1": float(v[0]), "p2": float(v[1])},
             "The lens of camera {where} has tangential distortion that its file leaves out",
@@ -93,41 +71,15 @@ def _lens(data: ImageData, c: int, name: str, rows: Array) -> Iterator[ImageCaus
             "camera",
             name,
             None,
-            _only(rows, by[:, :, 1:2]),
+            only(rows, by[:, :, 1:2]),
             np.array([1e-3 * f]),
             lambda v: {"fy_minus_fx_px": float(v[0])},
             "The pixels of camera {where} are not square: fy differs from fx by {fy_minus_fx_px:.2f} px",
         )
 
 
-def _refraction(data: ImageData, c: int, name: str, rows: Array) -> Iterator[ImageCause]:
-    """Behind a flat boundary of air to a medium, depths along its normal shrink by 1 - 1/index (near the normal).
-
-    What shows beside focal length and distance is the shrinking of depth differences. The normal is taken along the
-    camera's axis or an axis of the body.
-    """
-    _, by_point, _ = project_with_jacobians(data.cameras[c], data.p_camera)
-    body_axes = data.camera_R_body.swapaxes(1, 2)
-    normals = [np.broadcast_to([0.0, 0.0, 1.0], data.p_camera.shape), *(body_axes[:, k] for k in range(3))]
-    for normal in normals:
-        depth = np.einsum("mi,mi->m", normal, data.p_camera)
-        depth = depth - np.mean(depth[rows])
-        yield ImageCause(
-            "refraction",
-            "camera",
-            name,
-            None,
-            _only(rows, -by_point @ (normal * depth[:, None])[:, :, None]),
-            np.array([0.2]),
-            lambda v: {"index": float(1.0 / max(1.0 - v[0], 1e-3))},
-            "Camera {where} looks through a boundary of media (apparent index {index:.3f})",
-            weight=0.25,
-            plausible=lambda v: 0.03 < abs(float(v[0])) < 0.6,
-        )
-
-
 def _eccentricity(data: ImageData, c: int, name: str, rows: Array) -> Iterator[ImageCause]:
-    if np.any(data.radii[rows] > 0) or not np.any(np.isfinite(data.normal_camera[rows])):
+    if not data.dots or np.any(data.radii[rows] > 0) or not np.any(np.isfinite(data.normal_camera[rows])):
         return
     radius = 5e-3
     shift = centre_shift(data.cameras[c], data.p_camera, data.normal_camera, np.where(rows, radius, 0.0))
@@ -169,7 +121,7 @@ def _field(data: ImageData, c: int, name: str, rows: Array) -> ImageCause:
         "camera",
         name,
         None,
-        _only(rows, columns),
+        only(rows, columns),
         np.full(columns.shape[2], 0.1),
         report,
         "The images of {where} are bent in a manner that no lens model of the library describes",
@@ -183,27 +135,43 @@ def _moves(data: ImageData, name: str, rows: Array) -> Iterator[ImageCause]:
     first = np.unique(data.image[rows])
     if by is None or len(first) < 6:
         return
-    for pose in first[2:-2]:
+    # neighbouring change points look alike; the chosen one is refined afterwards
+    stride = int(np.ceil(len(first) / MOST_CHANGE_POINTS))
+    for pose in first[2:-1:stride]:
+        yield move_cause(data, by, name, rows, int(pose), stride / len(first))
 
-        def report(v: Array, label: str = data.image_names[int(pose)]) -> dict[str, object]:
-            return {
-                "pose": label,
-                "shift_mm": [1e3 * float(x) for x in v[:3]],
-                "turn_deg": [DEG * float(x) for x in v[3:]],
-            }
 
-        yield ImageCause(
-            "camera_moved",
-            "camera",
-            name,
-            None,
-            _only(rows & (data.image >= pose), by),
-            np.array([1e-3, 1e-3, 1e-3, 5e-4, 5e-4, 5e-4]),
-            report,
-            "Camera {where} moved before pose {pose}",
-            least_gain=0.01,
-            weight=1.0 / (len(first) - 4),
-        )
+def neighbouring_moves(data: ImageData, cause: ImageCause) -> Iterator[ImageCause]:
+    """The change points that :func:`image_causes` skipped around a found one."""
+    by, rows = data.by_exterior, data.camera == data.names.index(cause.where)
+    first = np.unique(data.image[rows])
+    stride = int(np.ceil(len(first) / MOST_CHANGE_POINTS))
+    if by is None or cause.pose is None or stride == 1:
+        return
+    at = int(np.searchsorted(first, cause.pose))
+    for pose in first[max(1, at - stride + 1) : min(len(first) - 1, at + stride)]:
+        yield move_cause(data, by, cause.where, rows, int(pose), cause.weight)
+
+
+def move_cause(data: ImageData, by: Array, name: str, rows: Array, pose: int, weight: float) -> ImageCause:
+    """A camera that stands elsewhere from an image on."""
+    label = data.image_names[pose]
+    return ImageCause(
+        "camera_moved",
+        "camera",
+        name,
+        None,
+        only(rows & (data.image >= pose), by),
+        np.array([1e-3, 1e-3, 1e-3, 5e-4, 5e-4, 5e-4]),
+        lambda v: {
+            "pose": label,
+            "shift_mm": [1e3 * float(x) for x in v[:3]],
+            "turn_deg": [DEG * float(x) for x in v[3:]],
+        },
+        "Camera {where} moved before pose {pose}",
+        weight=weight,
+        pose=pose,
+    )
 
 
 def _targets(data: ImageData, by_target: Array) -> Iterator[ImageCause]:
@@ -214,9 +182,42 @@ def _targets(data: ImageData, by_target: Array) -> Iterator[ImageCause]:
             "body",
             str(int(target)),
             None,
-            _only(data.target == target, by_target),
+            only(data.target == target, by_target),
             np.array([5e-4, 5e-4, 5e-4]),
             lambda v: {"shift_mm": [1e3 * float(x) for x in v]},
             "Target {where} sits at another place than its file says, by {shift_mm} mm",
             weight=1.0 / len(present),
+        )
+
+
+def _growth(data: ImageData, by_target: Array) -> Iterator[ImageCause]:
+    """A body that grows with a temperature, or a scale that drifts with time: the same in the images of a station."""
+    radial = by_target @ data.p_body[:, :, None]
+    warm = {name: v for name, v in data.covariates.items() if name.startswith("temp_") and np.ptp(v) > 0}
+    for name, change in warm.items():
+        yield ImageCause(
+            "body_thermal_growth",
+            "body",
+            data.body,
+            None,
+            radial * change[:, None, None],
+            np.array([1e-5]),
+            lambda v, name=name: {"um_per_m_K": 1e6 * float(v[0]), "covariate": name},  # type: ignore[misc]
+            "Body {where} grows by {um_per_m_K:.1f} um per metre and kelvin of {covariate}",
+            weight=0.5 / len(warm),
+            twins=(("scale_drift", "station"),),
+        )
+    hours = data.covariates.get("hours")
+    if hours is not None and np.ptp(hours) > 0:
+        yield ImageCause(
+            "scale_drift",
+            "camera",
+            "station",
+            None,
+            radial * hours[:, None, None],
+            np.array([50e-6 / float(np.max(np.abs(hours)))]),
+            lambda v: {"ppm_per_h": 1e6 * float(v[0])},
+            "The scale of the station drifts by {ppm_per_h:.1f} ppm an hour",
+            weight=0.25,
+            twins=(("body_thermal_growth", data.body),),
         )

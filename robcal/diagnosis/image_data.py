@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -11,28 +11,36 @@ from robcal.photogrammetry.bundle_operator import NetworkOperator
 from robcal.photogrammetry.camera import Camera
 from robcal.photogrammetry.eccentricity import body_normals
 from robcal.photogrammetry.network import CameraNetwork, Lengths
-from robcal.photogrammetry.station_adjustment import global_columns
-from robcal.photogrammetry.station_network import StationOrientation
 from robcal.physics.family import Array
-from robcal.transforms import invert, transform
+from robcal.transforms import transform
+
+LENS_TERMS = frozenset({"k1", "k2", "k3", "p1", "p2", "affinity"})
+"""Terms of the interior orientation that a camera file may lack."""
 
 
 @dataclass(frozen=True)
 class ImageData:
-    """Marks of all images with their residuals; rows of whitened vectors are x and y of each mark, (2m,).
+    """Marks of all images with their residuals.
+
+    Rows of whitened vectors are x and y of each mark, then (of a station) those of weighted observations of unknowns;
+    so `remove` is an orthogonal projection.
 
     Attributes
     ----------
-    names : of the cameras. cameras : their interior orientation. sizes : (c, 2) px.
-    camera, image, target : (m,) indices; `image` is the station of a survey or the pose of a station.
+    names : of the cameras. cameras : their interior orientation.
+    camera, image, target : (m,) indices; `image` is the station of a survey or the pose of a station; `target` the id.
     p_camera : (m, 3) target in the camera frame; camera_R_body : (m, 3, 3). normal_camera : (m, 3), NaN if unknown.
-    xy : (m, 2) px. residual : (2m,) whitened, unit variance expected. redundancy : (m, 2) numbers of the marks.
-    freedom : redundancy of the whole. whiten : displacements (m, 2, q) px to (2m, q). remove : projection.
+    xy : (m, 2) px. residual : (r,) whitened, unit variance expected. redundancy : (m, 2) numbers of the marks.
+    freedom : redundancy of the whole. whiten : displacements (m, 2, q) px to (r, q). remove : projection (r, q).
     by_exterior : (m, 2, 6) px by the camera's own exterior orientation, None for a survey.
-    by_target : (m, 2, 3) px by the target's body coordinates, None where they are unknowns.
-    free : names of the numbers of the interior orientation that are adjusted, per camera.
-    radii : (m,) m of the dots as modelled, 0 where the eccentricity is not.
+    by_target : (m, 2, 3) px by the target's body coordinates, None where they are plain unknowns.
+    p_body : (m, 3) the targets about their centroid. body : its name.
+    free : per camera the numbers of the interior orientation that are adjusted or in no file at all (`f_only`: fx and fy
+        change alike), so that their lack is no cause.
+    radii : (m,) m of the dots as modelled, 0 where the eccentricity is not. dots : whether the targets are round dots.
     sigma_px : typical standard deviation of a coordinate.
+    covariates : per mark, change since the first pose: `temp_<place>_c` in K, `hours` in h.
+    inflation : cause -> factor by which the scores of such candidates scatter more than the marks' noise says.
     """
 
     names: tuple[str, ...]
@@ -51,18 +59,20 @@ class ImageData:
     remove: Callable[[Array], Array]
     by_exterior: Array | None
     by_target: Array | None
+    p_body: Array
+    body: str
     free: tuple[frozenset[str], ...]
     radii: Array
     sigma_px: float
     image_names: tuple[str, ...]
-
-    @property
-    def spread(self) -> float:
-        """Pixels that stand for one unit of whitened residual, in the mean."""
-        return self.sigma_px
+    dots: bool = True
+    covariates: Mapping[str, Array] = field(default_factory=dict)
+    inflation: Mapping[str, float] = field(default_factory=dict)
 
 
-def survey_data(network: CameraNetwork, lengths: Lengths | None, camera_name: str) -> ImageData:
+def survey_data(
+    network: CameraNetwork, lengths: Lengths | None, camera_name: str, body: str = "body", *, dots: bool = True
+) -> ImageData:
     """The images of a finished survey."""
     operator = NetworkOperator(network, lengths)
     marks = network.marks
@@ -75,89 +85,27 @@ def survey_data(network: CameraNetwork, lengths: Lengths | None, camera_name: st
         free.add("f_only")
     white = operator.whiten(np.broadcast_to(np.eye(2), (len(marks), 2, 2)))
     return ImageData(
-        (camera_name,),
-        (network.camera,),
-        np.zeros(len(marks), dtype=int),
-        marks.image,
-        network.ids[marks.target],
-        transform(T, network.points[marks.target]),
-        T[:, :3, :3],
-        np.einsum("mij,mj->mi", T[:, :3, :3], normals[marks.target]),
-        marks.xy,
-        operator.residuals,
-        network.redundancy,
-        network.redundancy_total,
-        operator.whiten,
-        operator.project_out,
-        None,
-        None,
-        (frozenset(free),),
-        network.radii[marks.target],
-        float(1.0 / np.sqrt(np.mean(white**2) * 2.0)),
-        network.image_names,
-    )
-
-
-def station_data(orientation: StationOrientation, pose_names: tuple[str, ...]) -> ImageData:
-    """The images of an oriented station."""
-    marks, design = orientation.marks, orientation.design
-    camera_T_world = invert(orientation.world_T_exterior)[marks.exterior]
-    T = camera_T_world @ orientation.world_T_body[marks.pose]
-    columns = global_columns(marks, len(orientation.world_T_exterior), len(orientation.names))
-    A = np.concatenate([design.by_exterior, design.by_interior, design.by_point], axis=2)
-    size, poses = len(design.reduced_inverse), len(orientation.poses)
-
-    def remove(flat: Array) -> Array:
-        c = flat.reshape(len(marks), 2, -1)
-        q = c.shape[2]
-        to_global = np.einsum("mip,miq->mpq", A, c)
-        b = np.zeros((size, q))
-        for j in range(A.shape[2]):
-            np.add.at(b, columns[:, j], to_global[:, j])
-        v = np.zeros((poses, 6, q))
-        np.add.at(v, marks.pose, np.einsum("mip,miq->mpq", design.by_pose, c))
-        alone = np.einsum("pij,pjq->piq", design.pose_inverse, v)
-        x = design.reduced_inverse @ (b - np.einsum("gpi,piq->gq", design.coupling, alone))
-        z = alone - np.einsum("pij,gpj,gq->piq", design.pose_inverse, design.coupling, x, optimize=True)
-        left = c - np.einsum("mip,mpq->miq", A, x[columns])
-        return (left - np.einsum("mip,mpq->miq", design.by_pose, z[marks.pose])).reshape(flat.shape)
-
-    def whiten(displacement: Array) -> Array:
-        return (design.whitening @ displacement).reshape(2 * len(marks), -1)
-
-    unwhite = np.linalg.inv(design.whitening)
-    weight = orientation.body.covariance
-    held = weight is None or not np.any(weight)
-    groups = {
-        "focal": ("fx", "fy"),
-        "principal": ("cx", "cy"),
-        "tangential": ("p1", "p2"),
-        "affinity": ("affinity",),
-    }
-    free = tuple(
-        frozenset(part for g in orientation.free_interior.get(name, ()) for part in groups.get(g, (g,)))
-        for name in orientation.names
-    )
-    normals = np.where(np.isfinite(marks.normals), marks.normals, np.nan)
-    return ImageData(
-        orientation.names,
-        orientation.cameras,
-        marks.camera,
-        marks.pose,
-        orientation.body.ids[marks.target],
-        transform(T, orientation.body.points[marks.target]),
-        T[:, :3, :3],
-        np.einsum("mij,mj->mi", T[:, :3, :3], normals),
-        marks.xy,
-        design.residual.reshape(-1),
-        orientation.redundancy,
-        int(orientation.redundancy_total),
-        whiten,
-        remove,
-        unwhite @ design.by_exterior,
-        unwhite @ design.by_point if held else None,
-        free,
-        np.nan_to_num(marks.radius),
-        float(np.sqrt(np.mean(unwhite**2) * 2.0)),
-        tuple(pose_names[int(p)] for p in orientation.poses),
+        names=(camera_name,),
+        cameras=(network.camera,),
+        camera=np.zeros(len(marks), dtype=int),
+        image=marks.image,
+        target=network.ids[marks.target],
+        p_camera=transform(T, network.points[marks.target]),
+        camera_R_body=T[:, :3, :3],
+        normal_camera=np.einsum("mij,mj->mi", T[:, :3, :3], normals[marks.target]),
+        xy=marks.xy,
+        residual=operator.residuals,
+        redundancy=network.redundancy,
+        freedom=network.redundancy_total,
+        whiten=operator.whiten,
+        remove=operator.project_out,
+        by_exterior=None,
+        by_target=None,
+        p_body=network.points[marks.target] - network.points.mean(axis=0),
+        body=body,
+        free=(frozenset(free),),
+        radii=network.radii[marks.target],
+        sigma_px=float(1.0 / np.sqrt(np.mean(white**2) * 2.0)),
+        image_names=network.image_names,
+        dots=dots,
     )

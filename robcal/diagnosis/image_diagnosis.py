@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy import stats
 
 from robcal.diagnosis.family_wise import simulate
-from robcal.diagnosis.image_causes import ImageCause, image_causes
+from robcal.diagnosis.image_cause import ImageCause
+from robcal.diagnosis.image_causes import image_causes, neighbouring_moves
 from robcal.diagnosis.image_data import ImageData
 from robcal.diagnosis.scan import Entry, ScanResult, Stack, scan, stack_entries
 from robcal.physics.family import Array
@@ -74,22 +76,31 @@ def diagnose_images(data: ImageData, *, moves: bool = True, level: float = LEVEL
 
         stacks = stack_entries(listed, remove)
         freedom = data.freedom - added.shape[1]
-        result = scan(stacks, residual, freedom)
+        inflation = _inflation(causes, stacks, data, residual)
+        result = scan([_scaled(stack, inflation) for stack in stacks], residual, freedom)
         level_of = level_of or simulate(stacks, remove, freedom, len(residual), runs=RUNS, seed=seed)
         last_p = level_of.probability(float(result.log_p[result.best]))
         first_p = last_p if first_p is None else first_p
         if last_p > level or len(findings) == MOST:
             break
         chosen, score = _best(causes, result)
+        near = list(neighbouring_moves(data, causes[chosen])) if causes[chosen].pose is not None else []
+        if near:
+            more = [Entry(len(causes) + k, 0, data.whiten(c.columns) * c.sizes) for k, c in enumerate(near)]
+            causes += near
+            stacks = (*stacks, *stack_entries(more, remove))
+            inflation = np.concatenate([inflation, np.full(len(near), inflation[chosen])])
+            result = scan([_scaled(stack, inflation) for stack in stacks], residual, freedom)
+            chosen, score = _best(causes, result)
         cause = causes[chosen]
         basis, values, covariance = _estimate(stacks, chosen, residual, result.variance_factor, cause.sizes)
         left = _without(basis, residual)
-        after = _predicted(data, left, np.maximum(redundancy - np.sum(basis**2, axis=1), 1e-3))
+        remaining = np.maximum(redundancy - np.sum(basis[: len(redundancy)] ** 2, axis=1), 1e-3)
+        after = _predicted(data, left, remaining)
         if not cause.plausible(values) or after > (1.0 - cause.least_gain) * predicted:
             listed = [entry for entry in listed if entry.family != chosen]
             continue
-        residual = left
-        redundancy = np.maximum(redundancy - np.sum(basis**2, axis=1), 1e-3)
+        residual, redundancy = left, remaining
         told = cause.report(values)
         findings.append(
             ImageFinding(
@@ -98,7 +109,7 @@ def diagnose_images(data: ImageData, *, moves: bool = True, level: float = LEVEL
                 cause.where,
                 cause.direction,
                 told,
-                _sigma(cause, values, covariance),
+                _sigma(cause, values, covariance * inflation[chosen]),
                 last_p,
                 _rivals(causes, score, chosen),
                 (predicted, after),
@@ -107,8 +118,34 @@ def diagnose_images(data: ImageData, *, moves: bool = True, level: float = LEVEL
         )
         predicted = after
         added = np.concatenate([added, basis], axis=1)
-    floor = data.spread
+    floor = data.sigma_px
     return ImageDiagnosis(tuple(findings), first_p if first_p is not None else 1.0, last_p, (before, predicted, floor))
+
+
+def _inflation(causes: Sequence[ImageCause], stacks: Sequence[Stack], data: ImageData, residual: Array) -> Array:
+    """(causes,) factors by which scores scatter more than the noise of single marks says.
+
+    Errors that the marks of an image (or of a target) have in common make every image and every target look
+    displaced; only what stands out from the others is one. The median is hardly moved by the few that are.
+    """
+    factor = np.array([data.inflation.get(cause.cause, 1.0) for cause in causes])
+    shifted = np.array([cause.cause == "target_shifted" for cause in causes])
+    statistic, count = [], []
+    for stack in stacks:
+        use = shifted[stack.family] & (stack.count > 0)
+        if np.any(use):
+            statistic.append(np.sum(np.einsum("erc,r->ec", stack.basis[use], residual) ** 2, axis=1))
+            count.append(stack.count[use])
+    if statistic:
+        expected = stats.chi2.median(np.concatenate(count))
+        factor[shifted] = max(1.0, float(np.median(np.concatenate(statistic) / expected)))
+    return factor
+
+
+def _scaled(stack: Stack, inflation: Array) -> Stack:
+    """The stack with scores divided by the root of their inflation."""
+    root = np.sqrt(inflation[stack.family])
+    return replace(stack, basis=stack.basis / root[:, None, None], singular=stack.singular / root[:, None])
 
 
 def _without(basis: Array, columns: Array) -> Array:
@@ -118,7 +155,8 @@ def _without(basis: Array, columns: Array) -> Array:
 def _predicted(data: ImageData, residual: Array, redundancy: Array) -> float:
     """Root mean square in px of the marks, each predicted from all others (residual by its redundancy number)."""
     usable = redundancy > 0.05
-    return float(np.sqrt(np.mean((residual[usable] / redundancy[usable]) ** 2))) * data.spread
+    marks = residual[: len(redundancy)]
+    return float(np.sqrt(np.mean((marks[usable] / redundancy[usable]) ** 2))) * data.sigma_px
 
 
 def _best(causes: Sequence[ImageCause], result: ScanResult) -> tuple[int, Array]:
@@ -165,7 +203,7 @@ def _sigma(cause: ImageCause, values: Array, covariance: Array) -> dict[str, obj
 def _rivals(causes: Sequence[ImageCause], score: Array, chosen: int) -> tuple[tuple[str, str], ...]:
     own = (causes[chosen].cause, causes[chosen].where)
     near = [i for i in np.argsort(-score) if score[i] > score[chosen] - NEARLY_AS_GOOD and causes[i].cause != "unknown"]
-    listed = dict.fromkeys((causes[i].cause, causes[i].where) for i in near)
+    listed = dict.fromkeys([*causes[chosen].twins, *((causes[i].cause, causes[i].where) for i in near)])
     listed.pop(own, None)
     return tuple(listed)
 

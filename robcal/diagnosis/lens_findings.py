@@ -3,12 +3,13 @@ cameras that moved, targets that sit elsewhere."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 from scipy import stats
 
 from robcal.diagnosis.image_diagnosis import ImageFinding
+from robcal.photogrammetry.bodies import Body
 from robcal.photogrammetry.camera import INTRINSIC_NAMES, Camera
 from robcal.photogrammetry.network import CameraNetwork
 from robcal.photogrammetry.station_network import Evidence, StationOrientation
@@ -21,8 +22,10 @@ LENS_GROUPS: Mapping[str, tuple[str, ...]] = {
 }
 KIND = {"lens_radial": "radial distortion", "lens_tangential": "tangential distortion", "lens_affinity": "affinity"}
 LEVEL = 1e-4
-LEAST_PIXELS = 0.02
-"""Significance and size (root mean square over the image, px) from which a lens group is worth a name."""
+"""Significance from which a lens group is a cause. Marks of an image share small errors, hence more than 1 %."""
+
+EXCHANGED = 0.05
+"""Two shifted targets are swapped if they miss each other's place by less than this share of their distance."""
 
 
 def survey_findings(network: CameraNetwork, start: Camera | None, name: str) -> tuple[ImageFinding, ...]:
@@ -52,7 +55,7 @@ def survey_findings(network: CameraNetwork, start: Camera | None, name: str) -> 
         statistic = float(values @ np.linalg.solve(covariance, values))
         p_value = float(stats.chi2.sf(statistic, len(values)))
         before = float(np.sqrt(rms**2 + statistic * network.sigma0_px**2 / (2 * marks)))
-        if p_value > LEVEL or np.sqrt(before**2 - rms**2) < LEAST_PIXELS:
+        if p_value > LEVEL:
             continue
         names = ["fy_minus_fx_px"] if cause == "lens_affinity" else [n for n in group if n in network.free_intrinsics]
         told = dict(zip(names, map(float, values), strict=True))
@@ -73,20 +76,56 @@ def _difference() -> Array:
     return row
 
 
-def station_findings(orientation: StationOrientation, pose_names: tuple[str, ...]) -> Iterator[ImageFinding]:
-    """Recurring contradictions that the station's adjustment freed, strongest first."""
+def station_findings(
+    orientation: StationOrientation,
+    pose_names: tuple[str, ...],
+    given: Body | None = None,
+    inflation: Mapping[str, float] | None = None,
+) -> Iterator[ImageFinding]:
+    """Recurring contradictions that the station's adjustment freed, strongest first.
+
+    Parameters
+    ----------
+    pose_names : names of all poses. given : the body with the coordinates of its file, to see exchanged targets.
+    inflation : cause -> factor by which such scores scatter where nothing is wrong (errors common to an image).
+    """
     rms, marks = orientation.rms_px, len(orientation.marks)
-    for item in sorted(orientation.evidence, key=lambda e: -e.statistic):
-        before = float(np.sqrt(rms**2 * (1.0 + item.statistic / (2 * marks))))
-        p_value = float(stats.chi2.sf(item.statistic, item.degrees))
+    for item in sorted(_with_swaps(orientation.evidence, given), key=lambda e: -e.statistic):
         told, sigma, stage, text = _told(orientation, item, pose_names)
         if told is None:
             continue
+        statistic = item.statistic / (inflation or {}).get(item.kind, 1.0)
+        p_value = float(stats.chi2.sf(statistic, item.degrees))
+        if p_value > LEVEL:
+            continue
+        before = float(np.sqrt(rms**2 * (1.0 + item.statistic / (2 * marks)))) if np.isfinite(statistic) else np.nan
         rivals: tuple[tuple[str, str], ...] = ()
         if item.kind == "camera_moved" and len(orientation.names) == 2:
             other = next(name for name in orientation.names if name != item.where)
             rivals = (("camera_moved", other),)
-        yield ImageFinding(item.kind, stage, item.where, None, told, sigma, p_value, rivals, (before, rms), text)
+        where = item.where.split(",")[0]
+        yield ImageFinding(item.kind, stage, where, None, told, sigma, p_value, rivals, (before, rms), text)
+
+
+def _with_swaps(evidence: Sequence[Evidence], given: Body | None) -> list[Evidence]:
+    """Two targets of which each sits where the file has the other are swapped, not shifted."""
+    left = list(evidence)
+    if given is None:
+        return left
+    shifted = [item for item in evidence if item.kind == "target_shifted"]
+    for k, a in enumerate(shifted):
+        for b in shifted[k + 1 :]:
+            i, j = (int(given.index([int(item.where)])[0]) for item in (a, b))
+            way = given.points[j] - given.points[i]
+            near = EXCHANGED * float(np.linalg.norm(way))
+            exchange = np.linalg.norm(a.estimate - way) < near and np.linalg.norm(b.estimate + way) < near
+            if exchange and a in left and b in left:
+                left.remove(a)
+                left.remove(b)
+                pair = f"{a.where},{b.where}"
+                statistic = a.statistic + b.statistic
+                left.append(Evidence("target_swapped", pair, None, way, a.covariance, statistic, 6, a.statement))
+    return left
 
 
 def _told(
@@ -95,12 +134,13 @@ def _told(
     spread = np.sqrt(np.clip(np.diag(item.covariance), 0.0, None))
     if item.kind in LENS_GROUPS:
         camera = orientation.cameras[orientation.names.index(item.where)]
+        free = [n for n in LENS_GROUPS[item.kind] if n in {"p1", "p2", *orientation.free_interior[item.where]}]
         if item.kind == "lens_affinity":
             told: dict[str, object] = {"fy_minus_fx_px": camera.fy - camera.fx}
         else:
-            told = {name: float(getattr(camera, name)) for name in LENS_GROUPS[item.kind]}
+            told = {name: float(getattr(camera, name)) for name in free}
         text = f"The lens of camera '{item.where}' has {KIND[item.kind]} that its file leaves out"
-        return told, {}, "camera", text
+        return told, dict(zip(told, map(float, spread), strict=False)), "camera", text
     if item.kind == "camera_moved" and item.pose is not None:
         label = pose_names[item.pose]
         scale = np.r_[np.full(3, 1e3), np.full(3, np.degrees(1.0))]
@@ -111,6 +151,10 @@ def _told(
             f"{np.linalg.norm(values[3:]):.4f} deg"
         )
         return told, {"shift_mm": sigmas[:3].tolist(), "turn_deg": sigmas[3:].tolist()}, "camera", text
+    if item.kind == "target_swapped":
+        first, second = item.where.split(",")
+        text = f"Targets {first} and {second} are swapped: each sits where the file has the other"
+        return {"with": int(second)}, {}, "body", text
     if item.kind == "target_shifted":
         values = item.estimate * 1e3
         text = f"Target {item.where} sits {np.linalg.norm(values):.3f} mm from where its file says"
