@@ -103,7 +103,7 @@ class Chapter:
 
 @dataclass(frozen=True)
 class Verdict:
-    """The top of the report: how good, how it is known, what to load; `diagnosis` the sentence about what is missing."""
+    """The top of the report: how good, how it is known, what to load; `diagnosis` says what is missing."""
 
     grade: Grade
     word: str

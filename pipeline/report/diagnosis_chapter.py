@@ -2,13 +2,218 @@
 
 from __future__ import annotations
 
-from pipeline.report.blocks import Block, Chapter, Text
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from pipeline.report.blocks import Block, Chapter, Figure, Table, Text, table
+from pipeline.report.evidence_plots import evidence_figure
 from pipeline.report.material import Material
+from pipeline.report.robot_plot import robot_figure
+from pipeline.report.style import AFTER, BEFORE, GREY, label, layout, number, percent, rounded
+
+LEVEL = 0.01
+_NAMES = {
+    "joint_compliance": "elasticity about the joint's own axis",
+    "link_compliance": "elasticity across the joint's axis",
+    "stiffness_nonlinear": "stiffness that changes with load",
+    "lost_motion": "lost motion",
+    "zero_jump": "jump of a joint's zero",
+    "joint_eccentricity": "eccentricity of a joint's encoder or gear",
+    "gear_ripple": "ripple of a gear",
+    "transmission_ratio": "wrong transmission ratio",
+    "joint_coupling": "one joint drags another",
+    "axis_wobble": "wobble of an axis",
+    "counterbalance": "balancing torque",
+    "payload_mass": "mass of the load",
+    "payload_cog": "centre of gravity of the load",
+    "base_compliance": "base that gives way",
+    "base_tilt": "tilt of the base against gravity",
+    "thermal_growth": "thermal growth",
+    "thermal_zero_drift": "thermal drift of a joint's zero",
+    "lens_radial": "radial distortion of the lens",
+    "lens_tangential": "tangential distortion of the lens",
+    "lens_affinity": "affinity of the image",
+    "unknown": "unknown, described by an empirical term",
+}
 
 
 def diagnosis_chapter(material: Material) -> Chapter:
-    """One part for every cause."""
+    """The statement, one part for every cause, the gain, what is left, what to measure next."""
     blocks: list[Block] = []
-    if material.diagnosis is not None:
-        blocks.append(Text(str(material.diagnosis.get("statement", "")), "lead"))
+    d = material.diagnosis
+    if d is not None:
+        causes = d.get("causes", [])
+        blocks.append(Text(str(d.get("statement") or ""), "lead"))
+        blocks.append(Text(_how_sure(d)))
+        if causes:
+            blocks.append(_causes(causes))
+        blocks += _plots(material, causes)
+        gain = _gain(material, d)
+        blocks += gain
+        for cause in causes:
+            blocks += _rivals(cause)
+        blocks += _next_poses(d.get("next_poses") or [])
     return Chapter("diagnosis", "What the model left out", "", tuple(blocks))
+
+
+def said(name: object) -> str:
+    """A cause's name in words."""
+    return _NAMES.get(str(name), str(name).replace("_", " "))
+
+
+def _how_sure(d: Mapping[str, Any]) -> str:
+    p = d.get("p_value")
+    if d.get("mismatch"):
+        text = (
+            f"Were nothing missing, data like these would come with probability {number(p, 2)}; every candidate of the "
+            "library at every place was tried and the level holds for all of them together."
+        )
+    else:
+        text = (
+            "Every candidate of the library at every place was tried; the strongest of them is as strong as chance "
+            f"alone makes it with probability {number(p, 2)}. Nothing was added to the model."
+        )
+    noise = d.get("noise") or {}
+    factor = noise.get("estimated")
+    if factor is not None:
+        text += f" The data scatter {number(factor)} times what their covariance says"
+        text += "; that alone is no mismatch." if not 0.85 < float(factor) < 1.15 else "."
+    repeat = noise.get("joint_repeatability_deg")
+    if repeat:
+        text += f" The joints repeat to {number(repeat, 2)} deg, which was estimated and taken into account."
+    left = (d.get("unexplained") or {}).get("p_value")
+    if left is not None and d.get("mismatch"):
+        pattern = (d.get("unexplained") or {}).get("pattern")
+        text += (
+            f" After that nothing significant is left (p = {number(left, 2)})."
+            if left > LEVEL
+            else f" Something stays unexplained (p = {number(left, 2)}{', ' + str(pattern) if pattern else ''})."
+        )
+    if d.get("blunders"):
+        text += f" {len(d['blunders'])} observations are gross errors and took no part."
+    return text
+
+
+def _causes(causes: list[dict[str, Any]]) -> Table:
+    rows = []
+    for k, c in enumerate(causes, 1):
+        sigma = c.get("sigma") or {}
+        numbers = "; ".join(_parameter(n, v, sigma.get(n)) for n, v in (c.get("parameters") or {}).items())
+        held = c.get("heldout_mm") or c.get("heldout_px") or {}
+        unit = "mm" if c.get("heldout_mm") else "px"
+        place = f"{c.get('where')}" + (f", direction {c['direction']}" if c.get("direction") else "")
+        change = f"{number(held.get('before'))} → {number(held.get('after'))} {unit}" if held else "–"
+        explained = _share(c.get("explained"))
+        rows.append([k, said(c.get("cause")), place, numbers, number(c.get("p_value"), 2), explained, change])
+    return table(
+        ["", "Cause", "Where", "Parameters ± sigma", "p", "Explains", "Error on kept-out data"], rows,
+        "In the order in which they were accepted; the calibrated robot contains them.", text=(0, 1, 2, 3),
+    )  # fmt: skip
+
+
+def _parameter(name: str, value: Any, sigma: Any) -> str:
+    unit = ""
+    shown = name
+    for suffix, told in (("_deg_per_kNm3", "deg/kNm³"), ("_deg_per_kNm", "deg/kNm"), ("_um_per_m_K", "µm/(m K)"),
+                         ("um_per_m_K", "µm/(m K)"), ("_deg", "deg"), ("_mm", "mm"), ("_Nm", "N m"), ("_kg", "kg"),
+                         ("_ppm", "ppm"), ("_px", "px")):  # fmt: skip
+        if name.endswith(suffix) and name != suffix:
+            shown, unit = name.removesuffix(suffix).replace("_", " ") or "amount", f" {told}"
+            break
+    if isinstance(value, dict):
+        return f"{shown}: {value.get('formula') or value.get('kind') or value}"
+    if isinstance(value, list):
+        spread = sigma if isinstance(sigma, list) else [None] * len(value)
+        return f"{shown} " + ", ".join(_with_sigma(v, s) for v, s in zip(value, spread, strict=False)) + unit
+    return f"{shown} {_with_sigma(value, sigma)}{unit}"
+
+
+def _with_sigma(value: Any, sigma: Any) -> str:
+    if isinstance(value, str) or sigma is None:
+        return number(value)
+    digits = 3
+    if value and sigma and np.isfinite(float(sigma)) and float(sigma) > 0:
+        # as many figures as the sigma has two of
+        digits = int(np.clip(np.floor(np.log10(abs(value))) - np.floor(np.log10(float(sigma))) + 2, 1, 6))
+    return f"{number(value, digits)} ± {number(sigma, 2)}"
+
+
+def _plots(material: Material, causes: list[dict[str, Any]]) -> list[Block]:
+    blocks: list[Block] = []
+    evidence = material.evidence
+    for one in evidence.causes if evidence else ():
+        blocks.append(evidence_figure(one, said(one.cause)))
+    robot_causes = [c for c in causes if c.get("stage") in ("robot", "body", "sensor", "wire", "camera")]
+    if material.calibrated is not None and robot_causes:
+        figure = robot_figure(material, robot_causes)
+        blocks += [figure] if figure is not None else []
+    return blocks
+
+
+def _gain(material: Material, d: Mapping[str, Any]) -> list[Block]:
+    held, unit = (d.get("heldout_mm"), "mm") if d.get("heldout_mm") else (d.get("heldout_px"), "px")
+    if not held:
+        return []
+    kept = "kept-out poses" if held.get("kind") == "verify" else "blocks of poses kept out in turn"
+    kept = "marks, each predicted without itself" if unit == "px" else kept
+    floor = held.get("noise_floor")
+    before, after = number(held.get("before")), number(held.get("after"))
+    text = f"On {kept} the error is {before} {unit} (RMS) before and {after} after"
+    text += f"; the noise of the measurement alone gives {number(floor)} {unit}." if floor else "."
+    blocks: list[Block] = [Text(text)]
+    evidence = material.evidence
+    if evidence and d.get("mismatch") and len(evidence.poses):
+        order = np.argsort(-evidence.before, kind="stable")[:80]
+        names = [label(evidence.poses[i]) for i in order]
+        data = tuple(
+            {"type": "bar", "x": names, "y": rounded(values[order] * 1e3), "name": name, "marker": {"color": colour}}
+            for name, values, colour in (("before", evidence.before, BEFORE), ("after", evidence.after, AFTER))
+        )
+        lines, notes = [], []
+        if floor:
+            lines.append({"type": "line", "xref": "paper", "x0": 0, "x1": 1, "y0": floor, "y1": floor,
+                          "line": {"color": GREY, "dash": "dash"}})  # fmt: skip
+            notes.append({"xref": "paper", "x": 1, "y": floor, "text": "noise", "showarrow": False, "yanchor": "bottom",
+                          "xanchor": "right", "font": {"color": GREY}})  # fmt: skip
+        blocks.append(
+            Figure(data, layout("pose, the worst first", "error (mm)", barmode="group", shapes=lines, annotations=notes,
+                                xaxis={"type": "category", "nticks": 24}),
+                   f"What the diagnosis gains on {kept}: error of each pose with and without the causes found.",
+                   "Errors of kept-out poses before and after the diagnosis", height=300)
+        )  # fmt: skip
+    return blocks
+
+
+def _rivals(cause: Mapping[str, Any]) -> list[Block]:
+    rivals = cause.get("indistinguishable_from") or []
+    if not rivals:
+        return []
+    rows = [
+        [said(r.get("cause")), str(r.get("where")), r.get("direction") or "", _share(r.get("probability")),
+         _share(r.get("overlap"))]
+        for r in rivals
+    ]  # fmt: skip
+    return [
+        table(["Rival", "Where", "Direction", "Probability", "Overlap"], rows,
+              f"These explain the recording (nearly) as well as {said(cause.get('cause'))} at {cause.get('where')}: "
+              "overlap is the share of its signature that the rival can reproduce. Predictions within the measured "
+              "range are the same, whichever it is.", text=(0, 1, 2))
+    ]  # fmt: skip
+
+
+def _share(value: Any) -> str:
+    return "–" if value is None else percent(float(value))
+
+
+def _next_poses(rows: list[dict[str, Any]]) -> list[Block]:
+    if not rows:
+        return []
+    columns = list(dict.fromkeys(key for row in rows for key in row))
+    cells = [
+        [number(v, 5) if isinstance(v, float) else v for v in (row.get(c, "") for c in columns)] for row in rows
+    ]
+    return [
+        table(columns, cells, "Poses that would separate the rivals best; as a table in next_poses.csv.", shown=8)
+    ]

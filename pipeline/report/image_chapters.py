@@ -34,8 +34,8 @@ def image_chapter(material: Material) -> Chapter:
             entries = index.of(source)
             counts = np.array([e.targets for e in entries])
             rows.append([source, str(len(entries)), f"{entries[0].size[0]} x {entries[0].size[1]}",
-                         number(float(np.median(counts))), str(int(counts.min())),
-                         number(float(np.median([e.codes for e in entries]))), str(sum(e.saturated for e in entries)),
+                         f"{np.median(counts):.0f}", str(int(counts.min())),
+                         f"{np.median([e.codes for e in entries]):.0f}", str(sum(e.saturated for e in entries)),
                          str(int(np.sum(counts == 0)))])  # fmt: skip
             order = np.argsort(counts, kind="stable")
             usual, poor = entries[int(order[len(order) // 2])], entries[int(order[0])]
@@ -73,7 +73,8 @@ def _picture(material: Material, entry: object, why: str) -> Picture | None:
     told = f"{source}, {name} ({why}): {len(found)} targets, {int(np.sum(found.code >= 0))} codes"
     refused = sorted(found.rejected.counts.items(), key=lambda item: -item[1])[:3]
     if refused:
-        told += "; refused " + ", ".join(f"{count} {reason}" for reason, count in refused)
+        # the examples in brackets belong to the table of reasons, not under every picture
+        told += "; refused: " + ", ".join(f"{count} {str(reason).split(' (')[0]}" for reason, count in refused)
     return Picture(base64.b64encode(jpeg).decode("ascii"), told, width, height)
 
 
@@ -87,7 +88,7 @@ def drawn(grey: NDArray[np.uint8 | np.uint16], found: Detections, width: int = W
     # sub-pixel drawing: OpenCV takes coordinates with four binary places
     for x, y in found.rejected.xy[:300]:
         at = (round((x + 0.5) * scale - 0.5), round((y + 0.5) * scale - 0.5))
-        cv2.drawMarker(canvas, at, _VERMILION, cv2.MARKER_TILTED_CROSS, 5, 1, cv2.LINE_AA)
+        cv2.drawMarker(canvas, at, _VERMILION, cv2.MARKER_TILTED_CROSS, 4, 1)
     for i in range(len(found)):
         x, y = (found.xy[i] + 0.5) * scale - 0.5
         axes = np.maximum(found.semi_axes[i] * scale * 1.25, 3.0)
@@ -99,8 +100,9 @@ def drawn(grey: NDArray[np.uint8 | np.uint16], found: Detections, width: int = W
         )  # fmt: skip
         if read:
             at = (round(x + axes[0] + 3), round(y - axes[1] - 2))
-            cv2.putText(canvas, str(int(found.code[i])), at, cv2.FONT_HERSHEY_SIMPLEX, 0.42, (0, 0, 0), 3, cv2.LINE_AA)
-            cv2.putText(canvas, str(int(found.code[i])), at, cv2.FONT_HERSHEY_SIMPLEX, 0.42, (255, 255, 255), 1, cv2.LINE_AA)
+            for ink, thick in (((0, 0, 0), 3), ((255, 255, 255), 1)):
+                text = str(int(found.code[i]))
+                cv2.putText(canvas, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.5, ink, thick, cv2.LINE_AA)
     _, encoded = cv2.imencode(".jpg", canvas, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     return encoded.tobytes(), size[0], size[1]
 
@@ -117,12 +119,13 @@ def residual_chapter(material: Material) -> Chapter:
         for c, name in enumerate(station.names):
             mine = station.marks.camera == c
             camera = station.cameras[c]
-            blocks.append(_vectors(f"camera {name}", station.marks.xy[mine], pixels[mine], (camera.width, camera.height)))
+            size = (camera.width, camera.height)
+            blocks.append(_vectors(f"camera {name}", station.marks.xy[mine], pixels[mine], size))
     return Chapter(
         "residuals",
         "Image residuals",
-        "Measured minus projected, drawn large. Vectors that point about at random are noise; vectors that run together "
-        "over a region show something that the camera model does not know.",
+        "Measured minus projected, drawn large. Vectors that point about at random are noise; vectors that run "
+        "together over a region show something that the camera model does not know.",
         tuple(blocks),
     )
 

@@ -49,7 +49,7 @@ def _lengths(pairs: PairDeviations) -> Figure:
     return Figure(
         tuple(data),
         layout("measured minus expected length (mm)", "pairs of targets", barmode="stack", shapes=lines),
-        f"Deviations of {len(deviation)} lengths. Dashed: the tolerance (of the median pair, {number(limit)} mm).{clipped}",
+        f"Deviations of {len(deviation)} lengths. Dashed: tolerance of the median pair, {number(limit)} mm.{clipped}",
         "Histogram of length deviations with tolerance",
     )
 

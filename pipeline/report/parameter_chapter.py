@@ -66,7 +66,8 @@ def _parameters(calibrated: Any) -> Table:
 
 def _placements(model: RobotModel) -> Table:
     rows = []
-    for name, frame in (("base in the measuring system", model.world_T_base), ("tool on the flange", model.flange_T_tool)):
+    placed = {"base in the measuring system": model.world_T_base, "tool on the flange": model.flange_T_tool}
+    for name, frame in placed.items():
         if frame is None:
             continue
         six = xyzrpy_from_frame(np.asarray(frame))

@@ -28,7 +28,8 @@ def label(text: object) -> str:
 
 def layout(x: str = "", y: str = "", **more: Any) -> dict[str, Any]:
     """Layout of a plane plot with titled axes."""
-    axis = {"gridcolor": GRID, "zerolinecolor": "#9AA5B1", "linecolor": "#9AA5B1", "ticks": "outside", "automargin": True}
+    axis: dict[str, Any] = {"gridcolor": GRID, "zerolinecolor": "#9AA5B1", "linecolor": "#9AA5B1", "ticks": "outside"}
+    axis["automargin"] = True
     out: dict[str, Any] = {
         "font": {"family": "system-ui, sans-serif", "size": 13, "color": INK},
         "paper_bgcolor": "#FFFFFF",
@@ -41,23 +42,40 @@ def layout(x: str = "", y: str = "", **more: Any) -> dict[str, Any]:
     }
     for name, value in more.items():
         known = out.get(name)
-        out[name] = known | value if isinstance(known, Mapping) and isinstance(value, Mapping) else value
+        out[name] = {**known, **value} if isinstance(known, Mapping) and isinstance(value, Mapping) else value
     return out
 
 
-def scene(**more: Any) -> dict[str, Any]:
-    """Layout of a plot in space, axes in metres with equal scale."""
+def scene(up: Any = (0.0, 0.0, 1.0), **more: Any) -> dict[str, Any]:
+    """Layout of a plot in space, axes in metres with equal scale, seen from the side and a little from above.
+
+    `up` is the direction (3,) that is to point upwards on the screen.
+    """
+    z = np.asarray(up, dtype=float) / np.linalg.norm(up)
+    helper = np.eye(3)[int(np.argmin(np.abs(z)))]
+    side = np.cross(helper, z)
+    side /= np.linalg.norm(side)
+    eye = 1.35 * (0.62 * side + 0.62 * np.cross(side, z)) + 0.5 * z
+    xyz = ("x", "y", "z")
     axis = {"backgroundcolor": "#FFFFFF", "gridcolor": GRID, "zerolinecolor": GRID, "showspikes": False}
     view = {
         "aspectmode": "data",
         "xaxis": axis | {"title": {"text": "x (m)"}},
         "yaxis": axis | {"title": {"text": "y (m)"}},
         "zaxis": axis | {"title": {"text": "z (m)"}},
-        "camera": {"eye": {"x": 1.5, "y": -1.5, "z": 0.8}},
+        "camera": {
+            "eye": dict(zip(xyz, eye.tolist(), strict=True)),
+            "up": dict(zip(xyz, z.tolist(), strict=True)),
+        },
     }
     out = layout(margin={"l": 0, "r": 0, "t": 0, "b": 0}, scene=view | more.pop("scene", {}))
     del out["xaxis"], out["yaxis"]
     return out | more
+
+
+def percent(share: float) -> str:
+    """A share as text."""
+    return f"{100 * share:.0f} %"
 
 
 def rounded(values: Any, digits: int = 4) -> list[Any]:

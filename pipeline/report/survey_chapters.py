@@ -45,7 +45,8 @@ def _survey(name: str, survey: SurveyResult) -> list[Block]:
     ]
     blocks: list[Block] = [table([f"Survey of {name}", "Value", ""], rows, text=(0, 1, 2))]
     blocks += _lengths([*n.check_lengths, *n.scale_bars])
-    blocks.append(_interior({f"survey of {name}": (n.camera, np.sqrt(np.clip(np.diag(n.intrinsics_covariance), 0, None)))}))
+    interior = np.sqrt(np.clip(np.diag(n.intrinsics_covariance), 0, None))
+    blocks.append(_interior({f"survey of {name}": (n.camera, interior)}))
     if n.correlations:
         pairs = [[c.first, c.second, f"{c.value:+.3f}"] for c in sorted(n.correlations, key=lambda c: -abs(c.value))]
         blocks.append(table(["Unknown", "Hard to tell from", "Correlation"], pairs, "Correlations above 0.95.",
@@ -62,7 +63,8 @@ def _lengths(lengths: list[LengthResult]) -> list[Block]:
         return []
     rows = [
         ["check length" if c.kind == "check" else "scale bar", f"{c.ids[0]} – {c.ids[1]}", f"{c.expected * 1e3:.3f}",
-         f"{c.error * 1e3:+.4f}", number(c.sigma * 1e3, 2), f"{c.w:+.1f}"]
+         f"{c.error * 1e3:+.4f}", number(c.sigma * 1e3, 2) if c.sigma > 0 else "–",
+         f"{c.w:+.1f}" if c.sigma > 0 else "–"]
         for c in lengths
     ]  # fmt: skip
     checks = [abs(c.error) * 1e3 for c in lengths if c.kind == "check"]
@@ -80,11 +82,12 @@ def _station(station: StationOrientation) -> list[Block]:
     for c, name in enumerate(station.names):
         marks = int(np.sum(station.marks.camera == c))
         epochs = int(np.sum(station.exterior_camera == c))
-        rows.append([name, str(marks), number(station.noise.get(name)), ", ".join(station.free_interior.get(name, ())) or "–",
+        refined = ", ".join(station.free_interior.get(name, ())) or "–"
+        rows.append([name, str(marks), number(station.noise.get(name)), refined,
                      "stood still" if epochs == 1 else f"moved {epochs - 1} times"])  # fmt: skip
     told = (
-        f"Station: {len(station.poses)} poses, redundancy {station.redundancy_total:.0f}, sigma0 {number(station.sigma0)}, "
-        f"residuals {number(station.rms_px)} px RMS."
+        f"Station: {len(station.poses)} poses, redundancy {station.redundancy_total:.0f}, "
+        f"sigma0 {number(station.sigma0)}, residuals {number(station.rms_px)} px RMS."
     )
     blocks: list[Block] = [
         table(["Camera", "Marks", "Scatter / stated", "Refined", "Stand"], rows, told, text=(0, 3, 4))
@@ -96,13 +99,15 @@ def _station(station: StationOrientation) -> list[Block]:
 
 
 def _interior(cameras: dict[str, tuple[Camera, Array]]) -> Table:
-    rows = []
-    for name, (camera, sigma) in cameras.items():
-        values = [float(getattr(camera, n)) for n in INTRINSIC_NAMES]
-        rows.append([name, *(f"{number(v, 6 if k < 4 else 4)} ± {number(s, 2)}" if s > 0 else number(v, 6)
-                             for k, (v, s) in enumerate(zip(values, sigma, strict=True)))])  # fmt: skip
-    return table(["Camera", *(f"{n} (px)" if n in ("fx", "fy", "cx", "cy") else n for n in INTRINSIC_NAMES)], rows,
-                 "Interior orientation with sigmas (OpenCV's convention); without sigma: held.")  # fmt: skip
+    rows: list[list[str]] = []
+    for k, name in enumerate(INTRINSIC_NAMES):
+        row = [f"{name} (px)" if k < 4 else name]
+        for camera, sigma in cameras.values():
+            value, s = float(getattr(camera, name)), float(sigma[k])
+            row += [f"{value:.3f}" if k < 4 else f"{value:.6f}", number(s, 2) if s > 0 else "held"]
+        rows.append(row)
+    columns = ["Interior orientation", *(c for name in cameras for c in (name, "sigma"))]
+    return table(columns, rows, "OpenCV's convention, centre of the first pixel at (0, 0).")
 
 
 def network_chapter(material: Material) -> Chapter:
@@ -119,7 +124,7 @@ def network_chapter(material: Material) -> Chapter:
 def _camera_lines(world_T_camera: Array, size: float) -> tuple[list[float | None], ...]:
     """Outlines of pyramids for cameras (n, 4, 4), in one broken line."""
     s = size
-    corners = np.array([[-s, -0.75 * s, 1.5 * s], [s, -0.75 * s, 1.5 * s], [s, 0.75 * s, 1.5 * s], [-s, 0.75 * s, 1.5 * s]])
+    corners = s * np.array([[-1, -0.75, 1.5], [1, -0.75, 1.5], [1, 0.75, 1.5], [-1, 0.75, 1.5]])
     path = [None, 0, 1, None, 2, 3, None, 0, 3, 2, 1, 0]
     out: tuple[list[float | None], ...] = ([], [], [])
     for T in world_T_camera:
@@ -151,14 +156,14 @@ def _network(name: str, network: CameraNetwork) -> Figure:
     extent = float(np.max(np.linalg.norm(network.points - network.points.mean(axis=0), axis=1)))
     sigma = np.asarray(network.points_sigma) * 1e6
     sigma = sigma if sigma.ndim == 1 else np.linalg.norm(sigma, axis=1)
-    told = [f"target {i}, sigma {s:.1f} µm" for i, s in zip(network.ids, sigma, strict=True)]
+    seen = [f"target {i}, sigma {s:.1f} µm" for i, s in zip(network.ids, sigma, strict=True)]
     data = (
-        _dots(network.points, told, "targets", ACCENT, 4),
+        _dots(network.points, seen, "targets", ACCENT, 4),
         _lines(_camera_lines(body_T_camera, 0.06 * extent), "cameras", AFTER),
         _dots(body_T_camera[:, :3, 3], list(network.image_names), "camera positions", AFTER, 2.5),
     )
-    return Figure(data, scene(), f"Survey of {name}: {len(network.image_names)} photographs of {len(network.ids)} targets.",
-                  "Cameras and targets of the survey in space", height=480)  # fmt: skip
+    told = f"Survey of {name}: {len(network.image_names)} photographs, {len(network.ids)} targets."
+    return Figure(data, scene(), told, "Cameras and targets of the survey in space", height=480)
 
 
 def _station_scene(station: StationOrientation, material: Material) -> Figure:
@@ -174,7 +179,11 @@ def _station_scene(station: StationOrientation, material: Material) -> Figure:
     targets = (body @ np.swapaxes(station.world_T_body[:, :3, :3], 1, 2) + centres[:, None]).reshape(-1, 3)
     data.append(_dots(targets, [""] * len(targets), "targets in all poses", GREY, 1.5))
     data.append(_dots(centres, [material.pose_name(int(p)) for p in station.poses], "measured poses", GREEN, 3))
-    return Figure(tuple(data), scene(), "The station: cameras, and the body's place in every pose.",
+    # the cameras' own upward direction, or the robot's where it is known
+    up = -stands[0][:3, 1]
+    if material.calibrated is not None and material.calibrated.model.world_T_base is not None:
+        up = np.asarray(material.calibrated.model.world_T_base)[:3, 2]
+    return Figure(tuple(data), scene(up), "The station: cameras, and the body's place in every pose.",
                   "Station cameras and measured poses in space", height=520)  # fmt: skip
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from pipeline.report.blocks import Grade, KeyFigure, Verdict
 from pipeline.report.material import Material
-from pipeline.report.style import number
+from pipeline.report.style import number, percent
 from pipeline.report.verification_chapter import error_table, noise_by_tool
 from robcal.calibration.verification import Verification
 
@@ -23,8 +23,8 @@ def verdict_of(material: Material) -> Verdict:
     if material.surveys or material.station is not None:
         return _measuring(material)
     if material.stages:
-        return Verdict("none", "No verdict", "The run holds no verified robot and no survey.", "See the chapters below.",
-                       "Nothing yet.", told_diagnosis(material))  # fmt: skip
+        return Verdict("none", "No verdict", "The run holds no verified robot and no survey.",
+                       "See the chapters below.", "Nothing yet.", told_diagnosis(material))  # fmt: skip
     return Verdict("none", "Nothing done yet", "No stage of this campaign has finished.", "–", "Nothing yet.")
 
 
@@ -79,10 +79,13 @@ def _robot(material: Material, v: Verification) -> Verdict:
         if v.kind == "verify-set"
         else f"Cross-validated: each of {v.poses} poses predicted by a robot identified without it"
     )
-    reason = f"{kept}; {v.coverage_95:.0%} of them lie inside the predicted 95 % region."
+    reason = f"{kept}; {percent(v.coverage_95)} of them lie inside the predicted 95 % region."
     if "0" in noise:
         reason += f" The measurement alone scatters by {number(noise['0'] * 1e3)} mm (RMS) at the tool's origin."
-    load = "robot_calibrated.yaml; corrected targets or joint angles by 'pipeline compensate', controller code by 'pipeline export'."
+    load = (
+        "robot_calibrated.yaml; corrected targets or joint angles by 'pipeline compensate', code for the controller by "
+        "'pipeline export'."
+    )
     if grade == "bad":
         load = "Keep the nominal robot until the doubts are settled."
     return Verdict(

@@ -8,7 +8,7 @@ import numpy as np
 
 from pipeline.report.blocks import Block, Chapter, Figure, Table, Text, table
 from pipeline.report.material import Material
-from pipeline.report.style import AFTER, BEFORE, GREY, label, layout, number, rounded
+from pipeline.report.style import AFTER, BEFORE, GREY, label, layout, number, percent, rounded
 from robcal.calibration.observations import FrameObservations
 from robcal.calibration.verification import TEST_VECTORS, Verification
 from robcal.transforms import Array, skew
@@ -39,24 +39,30 @@ def noise_by_tool(material: Material) -> dict[str, float]:
 
 
 def error_table(verification: Verification, noise: Mapping[str, float], *, full: bool) -> Table:
-    """Errors before and after by tool, as in Table 5.1 of the thesis; `full` with extremes and spread."""
+    """Errors before and after by tool; `full` with extremes and spread, as in Table 5.1 of the thesis."""
     mm = 1000.0
-    rows = []
+    rows: list[list[object]] = []
     for name, after in verification.tools.items():
         before = verification.nominal[name] if verification.nominal else None
-        row: list[object] = [_tool(name, verification)]
-        for kind in ("mean", "max", "min", "std") if full else ("mean", "max"):
-            row += [number(getattr(before, kind) * mm) if before else "–", number(getattr(after, kind) * mm)]
-        row.append(number(after.rms * mm))
-        row.append(number(noise[name] * mm) if name in noise else "–")
-        rows.append(row)
-    kinds = ("Mean", "Largest", "Smallest", "Spread") if full else ("Mean", "Largest")
-    columns = ["Error in mm at"]
-    for kind in kinds:
-        columns += [f"{kind} before", f"{kind} after"]
-    columns += ["RMS after", "Noise of the measurement (RMS)"]
-    after_columns = [2 * k + 2 for k in range(len(kinds))]
-    return table(columns, rows, emphasis=after_columns)
+        place = _tool(name, verification)
+        floor = number(noise[name] * mm) if name in noise else "–"
+        if full:
+            for told, errors in (("before", before), ("after", after)):
+                if errors is not None:
+                    kinds = (errors.mean, errors.min, errors.max, errors.std, errors.rms)
+                    rows.append([place, told, *(number(v * mm) for v in kinds)])
+            if name in noise:
+                rows.append([place, "noise of the measurement alone", "", "", "", "", floor])
+            continue
+        pair = [(number(getattr(before, k) * mm) if before else "–", number(getattr(after, k) * mm))
+                for k in ("mean", "max", "rms")]  # fmt: skip
+        rows.append([place, *(v for both in pair for v in both), floor])
+    if full:
+        return table(["Error in mm at", "", "Mean", "Smallest", "Largest", "Spread", "RMS"], rows, text=(0, 1),
+                     emphasis=(2,))  # fmt: skip
+    pairs = [c for kind in ("Mean", "Largest", "RMS") for c in (f"{kind} before", "after")]
+    columns = ["Error in mm at", *pairs, "noise (RMS)"]
+    return table(columns, rows, emphasis=(2, 4, 6))
 
 
 def _tool(name: str, verification: Verification) -> str:
@@ -88,8 +94,8 @@ def _lead(material: Material) -> str:
     how = (
         f"{v.poses} poses that took no part in the identification or in any choice"
         if v.kind == "verify-set"
-        else f"{v.poses} poses, each predicted by a robot identified without it (cross-validation: the campaign keeps no "
-        "pose out)"
+        else f"{v.poses} poses, each predicted by a robot identified without it (cross-validation: the campaign keeps "
+        "no pose out)"
     )
     return (
         f"Measured minus modelled place on {how}. Before: the nominal robot after the best fit of base and tool on the "
@@ -104,12 +110,17 @@ def _bars(v: Verification, names: list[str]) -> Figure:
     if v.nominal_errors is not None and len(v.nominal_errors["0"]) == len(errors):
         data.append(_bar(order, v.nominal_errors["0"] * 1000, "before (nominal, best cell)", BEFORE))
     data.append(_bar(order, errors, "after (calibrated)", AFTER))
+    buttons = [{"label": told, "method": "relayout", "args": [{"yaxis.type": kind}]}
+               for told, kind in (("linear", "linear"), ("logarithmic", "log"))]  # fmt: skip
+    menu = {"type": "buttons", "direction": "right", "x": 1, "xanchor": "right", "y": 1.02, "yanchor": "bottom",
+            "buttons": buttons, "showactive": True, "bgcolor": "#fff"}  # fmt: skip
     return Figure(
         tuple(data),
-        layout("pose", "error (mm)", barmode="group", bargap=0.25, xaxis={"type": "category", "nticks": 30}),
+        layout("pose", "error (mm)", barmode="group", bargap=0.25, xaxis={"type": "category", "nticks": 30},
+               updatemenus=[menu]),
         "Error at the tool's origin, pose by pose.",
         "Bars: error of each pose before and after calibration",
-    )
+    )  # fmt: skip
 
 
 def _bar(x: list[str], y: Array, name: str, colour: str) -> dict[str, object]:
@@ -123,28 +134,30 @@ def _histogram(v: Verification) -> Figure:
     groups = [("after", v.errors, AFTER)]
     if v.nominal_errors is not None:
         groups.insert(0, ("before", v.nominal_errors, BEFORE))
+    every = np.concatenate([e for _, errors, _ in groups for e in errors.values()]) * 1000
+    positive = every[every > 0]
+    low, high = (np.log10(positive.min()), np.log10(positive.max())) if len(positive) else (-3.0, 0.0)
+    # bins of equal ratio: before and after lie a factor of ten or more apart
+    edges = np.logspace(low - 0.02, high + 0.02, max(8, min(40, int(12 * (high - low)) + 4)))
     data: list[dict[str, object]] = []
-    tools = list(v.errors)
-    largest = max(float(np.max(e["0"])) for _, e, _ in groups) * 1000
-    for k, tool in enumerate(tools):
+    for k, tool in enumerate(v.errors):
         for name, errors, colour in groups:
-            top = max(float(np.max(errors[tool])) * 1000, 1e-9)
-            edges = np.linspace(0, top, 13)
-            counts, _ = np.histogram(errors[tool] * 1000, edges)
+            counts, _ = np.histogram(np.clip(errors[tool] * 1000, edges[0], edges[-1]), edges)
             data.append(
-                {
-                    "type": "bar", "x": rounded(0.5 * (edges[1:] + edges[:-1])), "y": counts.tolist(),
-                    "width": [float(edges[1])] * len(counts), "name": f"{name}, {_tool(tool, v)}",
-                    "marker": {"color": colour, "opacity": 0.75, "line": {"width": 0.5, "color": "#fff"}},
-                    "visible": True if k == 0 else "legendonly",
-                }
+                {"type": "bar", "x": rounded(np.sqrt(edges[1:] * edges[:-1])), "y": counts.tolist(),
+                 "width": rounded(np.diff(edges)), "name": f"{name}, {_tool(tool, v)}",
+                 "marker": {"color": colour, "opacity": 0.8, "line": {"width": 0.5, "color": "#fff"}},
+                 "visible": True if k == 0 else "legendonly"}
             )  # fmt: skip
+    more = "; other tool points by a click in the legend" if len(v.errors) > 1 else ""
     return Figure(
         tuple(data),
-        layout("error (mm)", "poses", barmode="overlay", xaxis={"range": [0, largest * 1.05]}),
-        "Distribution of the errors; other tool points by a click in the legend.",
+        layout("error (mm), logarithmic", "poses", barmode="overlay",
+               xaxis={"type": "log", "dtick": "D2" if high - low < 1.5 else 1}),
+        f"Distribution of the errors{more}.",
         "Histogram of pose errors before and after calibration",
-    )
+        height=320,
+    )  # fmt: skip
 
 
 def _iso(v: Verification) -> Table:
@@ -178,15 +191,15 @@ def _calibration_of_uncertainty(v: Verification, names: list[str]) -> Figure:
         tuple(data),
         layout("pose", "error / predicted error", shapes=lines, yaxis={"rangemode": "tozero"},
                xaxis={"type": "category", "nticks": 30}, showlegend=False),
-        "Predicted against actual: error of each pose divided by what the covariance of model and measurement predicts. "
-        "Around one: the stated uncertainties hold.",
+        "Predicted against actual: error of each pose divided by what the covariance of model and measurement "
+        "predicts. Around one: the stated uncertainties hold.",
         "Normalised error of each pose",
         height=280,
     )  # fmt: skip
 
 
 def _honesty(v: Verification) -> str:
-    inside = f"{v.coverage_95:.0%} of the poses lie inside their 95 % region"
+    inside = f"{percent(v.coverage_95)} of the poses lie inside their 95 % region"
     if v.p_value < 0.01:
         return (
             f"{inside}; the errors are larger than predicted (p = {number(v.p_value, 2)}): some error is left that "
