@@ -26,7 +26,7 @@ from robcal.calibration.identifiability import (
     plausible_limits,
 )
 from robcal.calibration.observations import FrameObservations, Observations, Stack, basis_points
-from robcal.calibration.problem import Evaluator, Problem, State, whitening
+from robcal.calibration.problem import CellEvaluator, Evaluator, Problem, State, whitening
 from robcal.calibration.start_values import candidates
 from robcal.errors import InvalidInput, NotIdentifiable
 from robcal.least_squares import (
@@ -219,11 +219,15 @@ def start_state(evaluator: Evaluator, observations: Sequence[Observations]) -> S
     NotIdentifiable : nothing can be constructed and the model gives no references.
     """
     kernel = evaluator.kernel
-    theta = kernel.theta0
-    base_T_flange = kernel.with_references(np.eye(4), np.eye(4)).evaluate(theta, evaluator.poses)[0]
-    pairs = candidates(base_T_flange, observations)
+    cell = CellEvaluator(evaluator)
+    theta = cell.theta
+    pairs = candidates(cell.base_T_flange, observations)
     if kernel.model.world_T_base is not None and kernel.model.flange_T_tool is not None:
-        pairs.append((kernel.world_T_base, kernel.flange_T_tool))
+        given = kernel.theta0
+        pairs.append((
+            kernel.world_T_base @ tf.frame_from_xyzrpy(given[cell.base]),
+            kernel.flange_T_tool @ tf.frame_from_xyzrpy(given[cell.tool]),
+        ))
     if not pairs:
         raise NotIdentifiable(
             "no start values for base and tool can be constructed: measure at least 3 poses in 6D, 4 poses with one "
@@ -232,11 +236,10 @@ def start_state(evaluator: Evaluator, observations: Sequence[Observations]) -> S
         )
     if len(pairs) == 1:
         return State(theta, *pairs[0])
-    ends = [kernel.index[f"{end}.{k}"] for end in ("base", "tool") for k in ("x", "y", "z", "roll", "pitch", "yaw")]
     best: tuple[float, State] | None = None
     for pair in pairs:
         state = State(theta, *pair)
-        problem = Problem(evaluator, ends, whitening(evaluator, state))
+        problem = Problem(cell, [*cell.base, *cell.tool], whitening(cell, state))
         try:
             state, summary = gauss_newton(
                 problem.linearise, problem.residuals, problem.retract, state, TerminationSettings(15, 6, 1e-3)

@@ -65,6 +65,38 @@ class Evaluator:
         return evaluation
 
 
+class CellEvaluator(Evaluator):
+    """Evaluator for base and tool alone: the chain between them is evaluated once, which many start values share.
+
+    Weakness: where gravity is given in the world, loads stay as they are with the base along the world's axes.
+    """
+
+    def __init__(self, evaluator: Evaluator) -> None:
+        super().__init__(evaluator.kernel, evaluator.poses, evaluator.stack)
+        kernel = evaluator.kernel
+        self.theta = kernel.theta0.copy()
+        self.base = [kernel.index[f"base.{k}"] for k in GEOMETRIC_KINDS]
+        self.tool = [kernel.index[f"tool.{k}"] for k in GEOMETRIC_KINDS]
+        self.theta[[*self.base, *self.tool]] = 0.0
+        chain = kernel.with_references(np.eye(4), np.eye(4))
+        self.base_T_flange, _, self._moments = chain.evaluate(self.theta, evaluator.poses)
+
+    def __call__(self, state: State) -> Evaluation:
+        """The evaluation at a state; the Jacobian is zero but for base and tool."""
+        for known, evaluation in self._memory:
+            if known is state:
+                return evaluation
+        base_T_tool = self.base_T_flange @ state.flange_T_tool
+        T = state.world_T_base @ base_T_tool
+        J = np.zeros((len(T), 6, len(self.kernel.names)))
+        J[:, :, self.base] = tf.adjoint(tf.invert(base_T_tool))
+        J[:, :, self.tool] = np.eye(6)
+        stacked = self.stack.evaluate(T)
+        evaluation = Evaluation(T, J, self._moments, stacked.r, stacked.B)
+        self._memory = [(state, evaluation), *self._memory[:2]]
+        return evaluation
+
+
 class Problem:
     """Residuals of all observations at all poses.
 
