@@ -9,9 +9,11 @@ import numpy as np
 
 from pipeline.report.blocks import Block, Chapter, Figure, Table, Text, table
 from pipeline.report.evidence_plots import evidence_figure
+from pipeline.report.image_cause_plots import lens_figure, steps_figure
 from pipeline.report.material import Material
 from pipeline.report.robot_plot import robot_figure
-from pipeline.report.style import AFTER, BEFORE, GREY, label, layout, number, percent, rounded
+from pipeline.report.style import AFTER, BEFORE, GREY, label, layout, number, percent, probability, rounded
+from robcal.photogrammetry.camera import Camera
 
 LEVEL = 0.01
 _NAMES = {
@@ -45,7 +47,7 @@ def diagnosis_chapter(material: Material) -> Chapter:
     d = material.diagnosis
     if d is not None:
         causes = d.get("causes", [])
-        blocks.append(Text(str(d.get("statement") or ""), "lead"))
+        blocks.append(Text(short_statement(d), "lead"))
         blocks.append(Text(_how_sure(d)))
         if causes:
             blocks.append(_causes(causes))
@@ -58,6 +60,15 @@ def diagnosis_chapter(material: Material) -> Chapter:
     return Chapter("diagnosis", "What the model left out", "", tuple(blocks))
 
 
+def short_statement(d: Mapping[str, Any], most: int = 3) -> str:
+    """The statement of a diagnosis; of many causes the first ones."""
+    causes = d.get("causes") or []
+    if len(causes) <= most:
+        return str(d.get("statement") or "")
+    told = ". ".join(str(c.get("statement") or said(c.get("cause"))) for c in causes[:most])
+    return f"{told}. And {len(causes) - most} more, see below."
+
+
 def said(name: object) -> str:
     """A cause's name in words."""
     return _NAMES.get(str(name), str(name).replace("_", " "))
@@ -67,8 +78,8 @@ def _how_sure(d: Mapping[str, Any]) -> str:
     p = d.get("p_value")
     if d.get("mismatch"):
         text = (
-            f"Were nothing missing, data like these would come with probability {number(p, 2)}; every candidate of the "
-            "library at every place was tried and the level holds for all of them together."
+            f"Were nothing missing, data like these would come with probability {probability(p)}; every candidate of "
+            "the library at every place was tried and the level holds for all of them together."
         )
     else:
         text = (
@@ -106,10 +117,11 @@ def _causes(causes: list[dict[str, Any]]) -> Table:
         place = f"{c.get('where')}" + (f", direction {c['direction']}" if c.get("direction") else "")
         change = f"{number(held.get('before'))} → {number(held.get('after'))} {unit}" if held else "–"
         explained = _share(c.get("explained"))
-        rows.append([k, said(c.get("cause")), place, numbers, number(c.get("p_value"), 2), explained, change])
+        rows.append([k, said(c.get("cause")), place, numbers, probability(c.get("p_value")), explained, change])
     return table(
         ["", "Cause", "Where", "Parameters ± sigma", "p", "Explains", "Error on kept-out data"], rows,
-        "In the order in which they were accepted; the calibrated robot contains them.", text=(0, 1, 2, 3),
+        "In the order in which they were accepted; the results of this run are already corrected for them.",
+        text=(0, 1, 2, 3),
     )  # fmt: skip
 
 
@@ -131,7 +143,7 @@ def _parameter(name: str, value: Any, sigma: Any) -> str:
 
 
 def _with_sigma(value: Any, sigma: Any) -> str:
-    if isinstance(value, str) or sigma is None:
+    if isinstance(value, str) or not sigma:
         return number(value)
     digits = 3
     if value and sigma and np.isfinite(float(sigma)) and float(sigma) > 0:
@@ -145,11 +157,44 @@ def _plots(material: Material, causes: list[dict[str, Any]]) -> list[Block]:
     evidence = material.evidence
     for one in evidence.causes if evidence else ():
         blocks.append(evidence_figure(one, said(one.cause)))
+    blocks += _image_plots(material, causes)
     robot_causes = [c for c in causes if c.get("stage") in ("robot", "body", "sensor", "wire", "camera")]
     if material.calibrated is not None and robot_causes:
         figure = robot_figure(material, robot_causes)
         blocks += [figure] if figure is not None else []
     return blocks
+
+
+def _image_plots(material: Material, causes: list[dict[str, Any]]) -> list[Block]:
+    """The lens' curve where radial distortion was found; the error step by step where there are several causes."""
+    blocks: list[Block] = []
+    lenses = {str(c.get("where")) for c in causes if c.get("cause") == "lens_radial"}
+    for name, (camera, covariance) in _cameras(material).items():
+        if name in lenses:
+            blocks.append(lens_figure(f"camera {name}", camera, covariance))
+    d = material.diagnosis or {}
+    for key in ("heldout_px", "heldout_mm"):
+        mine = [c for c in causes if c.get(key)]
+        if len(mine) > 1 or (mine and key == "heldout_px"):
+            names = [f"{said(c.get('cause'))}, {c.get('where')}" for c in mine]
+            figure = steps_figure(mine, names, key, (d.get(key) or {}).get("noise_floor"))
+            blocks += [figure] if figure is not None else []
+    return blocks
+
+
+def _cameras(material: Material) -> dict[str, tuple[Camera, Any]]:
+    """Adjusted cameras with the covariance of their interior orientation, by the names the diagnosis gives them."""
+    out: dict[str, tuple[Camera, Any]] = {}
+    for name, survey in material.surveys.items():
+        known = material.campaign.bodies.get(name) if material.campaign is not None else None
+        source = known.survey if known is not None else None
+        path = source.start_path if source is not None else None
+        network = survey.network
+        out[path.stem if path is not None else f"survey_{name}"] = (network.camera, network.intrinsics_covariance)
+    if material.station is not None:
+        for name, camera in zip(material.station.names, material.station.cameras, strict=True):
+            out[name] = (camera, material.station.camera_covariance(name)[1])
+    return out
 
 
 def _gain(material: Material, d: Mapping[str, Any]) -> list[Block]:

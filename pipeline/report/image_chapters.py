@@ -148,14 +148,14 @@ def _vectors(name: str, xy: Array, residual: Array, size: tuple[int, int]) -> Fi
     ax: list[float | None] = []
     ay: list[float | None] = []
     for a, m in zip(centres, means, strict=True):
-        b = a + 4 * magnification * m
+        b = a + 2 * magnification * m
         ax += [round(float(a[0]), 1), round(float(b[0]), 1), None]
         ay += [round(float(a[1]), 1), round(float(b[1]), 1), None]
     told = [f"{c} marks, mean {number(m[0], 2)}, {number(m[1], 2)} px" for c, m in zip(counts, means, strict=True)]
     data: tuple[Mapping[str, object], ...] = (
         {"type": "scatter", "mode": "lines", "x": x, "y": y, "name": f"residuals x {magnification:g}",
          "line": {"color": GREY, "width": 1}, "hoverinfo": "skip", "opacity": 0.55},
-        {"type": "scatter", "mode": "lines", "x": ax, "y": ay, "name": f"mean of a region x {4 * magnification:g}",
+        {"type": "scatter", "mode": "lines", "x": ax, "y": ay, "name": f"mean of a region x {2 * magnification:g}",
          "line": {"color": AFTER, "width": 3}, "hoverinfo": "skip"},
         {"type": "scatter", "mode": "markers", "x": centres[:, 0].tolist(), "y": centres[:, 1].tolist(), "text": told,
          "marker": {"size": 6, "color": AFTER}, "showlegend": False, "hovertemplate": "%{text}<extra></extra>"},
@@ -173,10 +173,10 @@ def _vectors(name: str, xy: Array, residual: Array, size: tuple[int, int]) -> Fi
 
 
 def _field(xy: Array, residual: Array, size: tuple[int, int], across: int = 8) -> tuple[Array, Array, list[int]]:
-    """Centres, mean residuals and numbers of marks of square regions with five marks or more."""
+    """Centres, mean residuals and numbers of marks of square regions with eight marks or more."""
     step = size[0] / across
     cell = np.floor(xy / step).astype(int)
     keys, inverse, counts = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
     means = np.stack([np.bincount(inverse.ravel(), residual[:, k]) / counts for k in range(2)], axis=1)
-    keep = counts >= 5
+    keep = counts >= 8
     return (keys[keep] + 0.5) * step, means[keep], [int(c) for c in counts[keep]]

@@ -55,7 +55,7 @@ def scene(up: Any = (0.0, 0.0, 1.0), **more: Any) -> dict[str, Any]:
     helper = np.eye(3)[int(np.argmin(np.abs(z)))]
     side = np.cross(helper, z)
     side /= np.linalg.norm(side)
-    eye = 1.35 * (0.62 * side + 0.62 * np.cross(side, z)) + 0.5 * z
+    eye = 1.6 * (0.62 * side + 0.62 * np.cross(side, z)) + 0.6 * z
     xyz = ("x", "y", "z")
     axis = {"backgroundcolor": "#FFFFFF", "gridcolor": GRID, "zerolinecolor": GRID, "showspikes": False}
     view = {
@@ -76,6 +76,13 @@ def scene(up: Any = (0.0, 0.0, 1.0), **more: Any) -> dict[str, Any]:
 def percent(share: float) -> str:
     """A share as text."""
     return f"{100 * share:.0f} %"
+
+
+def probability(p: object) -> str:
+    """A probability as text; what is too small to matter is told as a bound."""
+    if isinstance(p, int | float) and np.isfinite(p) and p < 1e-12:
+        return "< 1e-12"
+    return number(p, 2)
 
 
 def rounded(values: Any, digits: int = 4) -> list[Any]:
@@ -100,6 +107,6 @@ def number(value: object, digits: int = 3) -> str:
     if v == 0:
         return "0"
     magnitude = int(np.floor(np.log10(abs(v))))
-    if magnitude < -5 or magnitude > 6:
+    if magnitude < -7 or magnitude > 6:
         return f"{v:.{digits - 1}e}"
     return f"{v:.{max(digits - 1 - magnitude, 0)}f}"

@@ -51,7 +51,7 @@ def _survey(name: str, survey: SurveyResult) -> list[Block]:
         pairs = [[c.first, c.second, f"{c.value:+.3f}"] for c in sorted(n.correlations, key=lambda c: -abs(c.value))]
         blocks.append(table(["Unknown", "Hard to tell from", "Correlation"], pairs, "Correlations above 0.95.",
                             text=(0, 1), shown=8))  # fmt: skip
-    if survey.deviations:
+    if any(d > 1e-9 for _, d in survey.deviations):
         worst = sorted(survey.deviations, key=lambda d: -d[1])[:5]
         text = ", ".join(f"{number(d * 1e3)} mm at target {i}" for i, d in worst)
         blocks.append(Text(f"Given coordinates against surveyed ones after the fit; largest deviations: {text}."))

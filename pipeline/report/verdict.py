@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.report.blocks import Grade, KeyFigure, Verdict
+from pipeline.report.diagnosis_chapter import short_statement
 from pipeline.report.material import Material
 from pipeline.report.style import number, percent
 from pipeline.report.verification_chapter import error_table, noise_by_tool
@@ -33,7 +34,7 @@ def told_diagnosis(material: Material) -> str:
     d = material.diagnosis
     if d is None:
         return ""
-    text = str(d.get("statement") or "")
+    text = short_statement(d)
     left = d.get("unexplained") or {}
     p = left.get("p_value")
     if p is not None and p < LEVEL:
@@ -112,6 +113,11 @@ def _keys(material: Material, v: Verification, noise: dict[str, float], gain: fl
     return tuple(keys)
 
 
+def _sentence(parts: list[str]) -> str:
+    text = "; ".join(parts)
+    return f"{text[:1].upper()}{text[1:]}."
+
+
 def _measuring(material: Material) -> Verdict:
     grade: Grade = "good"
     parts, reasons, keys = [], [], []
@@ -146,10 +152,9 @@ def _measuring(material: Material) -> Verdict:
     if (left is not None and left < LEVEL) or any(c.get("cause") == "unknown" for c in diagnosis.get("causes", [])):
         grade = "care" if grade == "good" else grade
         parts.append("but the images show something that the camera model does not explain")
-    sentence = "; ".join(parts)
     word = {"good": "Good", "care": "Usable, with care", "bad": "Not usable"}.get(grade, "")
     return Verdict(
-        grade, word, f"{sentence[:1].upper()}{sentence[1:]}.", f"{'; '.join(reasons)}.",
+        grade, word, _sentence(parts), _sentence(reasons),
         "bodies/*.yaml (surveyed coordinates with sigmas) and cameras/*.yaml (calibrated cameras).",
         told_diagnosis(material), tuple(keys),
     )  # fmt: skip

@@ -1,0 +1,65 @@
+"""Plots for causes found in images: the lens' curve with its uncertainty, and the error step by step."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from pipeline.report.blocks import Figure
+from pipeline.report.style import AFTER, BEFORE, GREY, label, layout, number, rounded
+from robcal.photogrammetry.camera import INTRINSIC_NAMES, Camera
+from robcal.transforms import Array
+
+_RADIAL = tuple(INTRINSIC_NAMES.index(name) for name in ("k1", "k2", "k3"))
+
+
+def lens_figure(name: str, camera: Camera, covariance: Array) -> Figure:
+    """Radial distortion (px) over the radius, with the band of two sigma from the covariance of k1, k2, k3."""
+    corner = np.array([max(camera.cx, camera.width - camera.cx), max(camera.cy, camera.height - camera.cy)])
+    r = np.linspace(0, float(np.hypot(*(corner / [camera.fx, camera.fy]))), 80)
+    f = 0.5 * (camera.fx + camera.fy)
+    J = np.stack([r**3, r**5, r**7], axis=1) * f
+    shift = J @ np.array([camera.k1, camera.k2, camera.k3])
+    sigma = np.sqrt(np.clip(np.einsum("ni,ij,nj->n", J, covariance[np.ix_(_RADIAL, _RADIAL)], J), 0, None))
+    x = rounded(r * f)
+    band = {"type": "scatter", "mode": "lines", "line": {"width": 0}, "showlegend": False, "hoverinfo": "skip"}
+    data: list[dict[str, Any]] = [
+        {**band, "x": x, "y": rounded(shift - 2 * sigma)},
+        {**band, "x": x, "y": rounded(shift + 2 * sigma), "fill": "tonexty", "fillcolor": "rgba(0,114,178,0.22)",
+         "name": "two sigma", "showlegend": True},
+        {"type": "scatter", "mode": "lines", "x": x, "y": rounded(shift), "name": "identified",
+         "line": {"color": AFTER, "width": 3}},
+        {"type": "scatter", "mode": "lines", "x": [x[0], x[-1]], "y": [0, 0], "name": "camera file",
+         "line": {"color": BEFORE, "width": 2, "dash": "dash"}},
+    ]  # fmt: skip
+    told = f"Radial distortion of {label(name)}: the camera file has none, the images show this."
+    return Figure(tuple(data), layout("distance from the principal point (px)", "radial shift (px)"), told,
+                  f"Radial distortion of {name}", height=320, wide=False)  # fmt: skip
+
+
+def steps_figure(
+    causes: Sequence[dict[str, Any]], names: Sequence[str], key: str, floor: float | None
+) -> Figure | None:
+    """Error on kept-out data before anything, and with each cause added to those before it."""
+    unit = key.removeprefix("heldout_")
+    held = [(n, c[key]) for c, n in zip(causes, names, strict=True) if c.get(key)]
+    if not held or any(h.get("before") is None or h.get("after") is None for _, h in held):
+        return None
+    x = ["before", *(f"{k}. {label(n)}" for k, (n, _) in enumerate(held, 1))]
+    y = [held[0][1]["before"], *(h["after"] for _, h in held)]
+    data = {"type": "bar", "x": x, "y": rounded(y), "marker": {"color": [BEFORE] + [AFTER] * len(held)},
+            "text": [number(v) for v in y], "textposition": "outside", "cliponaxis": False}  # fmt: skip
+    shapes = []
+    if floor:
+        shapes = [{"type": "line", "xref": "paper", "x0": 0, "x1": 1, "y0": floor, "y1": floor,
+                   "line": {"color": GREY, "dash": "dash"}}]  # fmt: skip
+    return Figure(
+        (data,),
+        layout("", f"error ({unit}, RMS)", shapes=shapes, showlegend=False, xaxis={"type": "category"}),
+        "Error on kept-out data, step by step as the causes were added. Dashed: noise of the measurement.",
+        "Error on kept-out data with each cause added",
+        height=320,
+        wide=False,
+    )
