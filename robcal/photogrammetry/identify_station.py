@@ -56,12 +56,31 @@ def identify_station(
         for pose in sorted(detections[name]):
             # the robot may go anywhere between two poses: the last pose is no prediction
             found[name, pose] = identify_targets(detections[name][pose], body, start[name], model_error_px=loose[name])
+    _by_other_views(found, detections, body, start, loose)
     orientation = _orient(found, detections, body, cameras, sizes)
     if orientation is not None:
         _second_round(found, detections, body, orientation)
     marks = {name: _marks(name, found, detections[name]) for name in sizes}
     problems = tuple((n, p, image.reason) for (n, p), image in sorted(found.items()) if image.reason)
     return StationIdentification(marks, found, problems)
+
+
+def _by_other_views(
+    found: dict[tuple[str, int], IdentifiedImage],
+    detections: Mapping[str, Mapping[int, Detections]],
+    body: Body,
+    start: Mapping[str, Camera],
+    loose: Mapping[str, float],
+) -> None:
+    """Images of a regular body with several numberings: cameras from similar directions may decide."""
+    for (name, pose), image in list(found.items()):
+        if image.method != "none" or len(image.alternatives) < 2:
+            continue
+        others = [v for (n, p), o in found.items() if p == pose and n != name and (v := o.view) is not None]
+        if others:
+            found[name, pose] = identify_targets(
+                detections[name][pose], body, start[name], model_error_px=loose[name], others=others
+            )
 
 
 def _marks(
@@ -113,7 +132,8 @@ def _second_round(
     for (name, pose), before in list(found.items()):
         if name not in orientation.names or pose not in at:
             continue
-        if len(before.rows) >= body.known.sum():
+        # what was found by rows among many false dots was already searched with an adjusted lens
+        if len(before.rows) >= body.known.sum() or before.method == "rows":
             continue
         c = orientation.names.index(name)
         e = int(orientation.exterior_of(c, [pose])[0])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,8 @@ from robcal.imaging.detections import Detections, TargetKind
 from robcal.photogrammetry.bodies import Body, IntArray
 from robcal.photogrammetry.camera import Camera, project_with_jacobians
 from robcal.photogrammetry.eccentric_circle import effective_point
+from robcal.photogrammetry.identify_grid import has_rows, search_grid
+from robcal.photogrammetry.identify_grow import View, view_of
 from robcal.photogrammetry.identify_search import match_dots, search_body
 from robcal.photogrammetry.resection import refine_poses, resect
 from robcal.transforms import Array, skew, transform
@@ -38,9 +40,10 @@ class IdentifiedImage:
     ----------
     rows : (k,) rows of the detections; ids : (k,) target ids.
     camera_T_body : pose found on the way, None where only codes were read.
-    method : 'codes', 'prediction', 'search' or 'none'.
+    method : 'codes', 'prediction', 'search', 'rows' (search by rows of dots) or 'none'.
     alternatives : other poses (with other numberings) that fit as well; then nothing is identified.
     reason : why nothing was identified, else empty.
+    view : where rows of dots were identified, what this camera sees, as evidence for others.
     """
 
     rows: IntArray
@@ -49,6 +52,7 @@ class IdentifiedImage:
     method: str
     alternatives: tuple[Array, ...] = ()
     reason: str = ""
+    view: View | None = None
 
 
 def identify_targets(
@@ -59,6 +63,7 @@ def identify_targets(
     predictions: Sequence[Prediction] = (),
     model_error_px: float = 3.0,
     search: bool = True,
+    others: Sequence[View] = (),
 ) -> IdentifiedImage:
     """Identify the targets of a body in one image.
 
@@ -71,6 +76,8 @@ def identify_targets(
     predictions : expected poses, each tried; the one that explains most dots wins.
     model_error_px : error in the image that the camera's start values may cause.
     search : allow the search without prediction (refused where the numbering is not unique).
+    others : what other cameras see of the body at this moment (by rows of its uncoded targets with coordinates); they
+        may decide between numberings of a regular body.
     """
     rows, ids = _coded(detections, body)
     at = body.index(ids)
@@ -100,26 +107,68 @@ def identify_targets(
     candidates = np.flatnonzero(body.known & ~np.isin(body.ids, ids) & _uncoded(body))
     reason = f"{len(ids)} coded targets read, too few for a pose"
     if search and len(candidates) >= 4:
+        if has_rows(body.points[candidates]) and len(dots) > len(candidates) // 2:
+            grid = _from_rows(detections, body, camera, candidates, dots, model_error_px, others)
+            if grid.method != "none" or grid.alternatives:
+                return _joined(rows, ids, grid)
         found, why = search_body(
             camera, detections.xy[dots], detections.covariance[dots], detections.semi_axes[dots, 0], body, candidates,
             model_error_px=model_error_px,
         )  # fmt: skip
         if len(found) == 1:
-            ids_found = body.ids[found[0].targets]
-            all_rows = np.concatenate([rows, dots[found[0].rows]])
-            return IdentifiedImage(
-                all_rows, np.concatenate([ids, ids_found]), found[0].camera_T_body, "search"
+            single = IdentifiedImage(
+                dots[found[0].rows], body.ids[found[0].targets], found[0].camera_T_body, "search"
             )
+            return _joined(rows, ids, single)
         if len(found) > 1:
             return IdentifiedImage(
-                none, none, None, "none", tuple(f.camera_T_body for f in found),
-                f"{len(found)} numberings of the dots fit equally well (the arrangement is symmetric): "
-                "use coded targets or a second camera",
-            )  # fmt: skip
+                none, none, None, "none", tuple(f.camera_T_body for f in found), _symmetric(len(found))
+            )
         reason = why
     if len(rows):
         return IdentifiedImage(rows, ids, None, "codes", (), reason if placed.sum() < 3 else "")
     return IdentifiedImage(none, none, None, "none", (), reason)
+
+
+def _symmetric(numberings: int) -> str:
+    return (
+        f"{numberings} numberings of the dots fit equally well (the arrangement is symmetric): "
+        "use coded targets or a second camera"
+    )
+
+
+def _joined(rows: IntArray, ids: IntArray, found: IdentifiedImage) -> IdentifiedImage:
+    """A result of the search with the coded targets that were read."""
+    if found.method == "none":
+        return found
+    return replace(found, rows=np.concatenate([rows, found.rows]), ids=np.concatenate([ids, found.ids]))
+
+
+def _from_rows(
+    detections: Detections, body: Body, camera: Camera, candidates: IntArray, dots: IntArray, model_error_px: float,
+    others: Sequence[View],
+) -> IdentifiedImage:  # fmt: skip
+    """The search by rows of dots: one numbering, several (refused), or nothing with a reason."""
+    size = np.sqrt(detections.semi_axes[dots].prod(axis=1))
+    found, why = search_grid(
+        camera, detections.xy[dots], size, detections.contrast[dots], body, candidates,
+        model_error_px=model_error_px, others=others,
+    )  # fmt: skip
+    none = np.empty(0, dtype=np.int64)
+    if len(found) != 1:
+        poses = tuple(f.camera_T_body for f in found)
+        return IdentifiedImage(none, none, None, "none", poses, _symmetric(len(found)) if found else why)
+    best = found[0]
+    rows, targets = dots[best.dots], candidates[best.targets]
+    zero = np.zeros(len(rows), dtype=np.int64)
+    covariance = detections.covariance[rows] + best.rms**2 * np.eye(2)
+    # the pose that belongs to the camera as given, not to the lens adjusted on the way
+    fit = refine_poses(
+        best.camera_T_body[None], zero, zero, [camera], np.eye(4)[None], body.points[targets], detections.xy[rows],
+        covariance,
+    )  # fmt: skip
+    view = view_of(best, body.points[candidates])
+    return IdentifiedImage(rows, body.ids[targets], fit.reference_T_body[0], "rows", view=view)
 
 
 def _uncoded(body: Body) -> NDArray[np.bool_]:
