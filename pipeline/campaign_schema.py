@@ -97,7 +97,7 @@ class ModelEntry(Entry):
 
     parameters: Literal["standard", "geometry", "table5.4"] | list[Text] = "standard"
     objective: Literal["maximum_likelihood", "basis_norm"] = "maximum_likelihood"
-    robust: bool = False
+    robust: bool = True
     statics: Literal["one_step", "converged"] = "converged"
     joint_sigma_deg: NotNegative | None = None
 

@@ -12,6 +12,7 @@ from typing import Any
 
 from pipeline.campaign import Campaign, read_campaign
 from pipeline.codec import StaleCache
+from pipeline.files import storage_error
 from pipeline.messages import Messages
 from pipeline.runs import (
     RUN_FORMAT,
@@ -165,6 +166,9 @@ def _run_stage(stage: Stage, key: str, context: Context) -> None:
     except RobcalError as error:
         messages.record(f"stage {stage.name} failed: {error}")
         raise
+    except OSError as error:
+        messages.record(traceback.format_exc())
+        raise storage_error(Path(error.filename or run.folder), error) from None
     except MemoryError:
         raise InvalidInput(f"stage {stage.name}: not enough memory: use smaller images or fewer at once") from None
     except Exception as error:

@@ -74,8 +74,8 @@ def work(context: Context) -> Outcome:
     points: MeasuredPoints | None = run.load("points") if run.has("points") else None
     found, measured = identification.robot(), identification.recording
     body = body_for_robot(campaign, run)
-    used = np.array([row for row, use in zip(identification.rows, found.used, strict=True) if use], dtype=np.int64)
-    recording = recording_for_diagnosis(poses, measured, used, body, points)
+    # all of them: what a few poses have against the others may be a blunder, or an effect of one place in the workspace
+    recording = recording_for_diagnosis(poses, measured, identification.rows, body, points)
     kept_out = np.array([i for i in measured.poses if poses.verify[i]], dtype=np.int64)
     verify = recording_for_diagnosis(poses, measured, kept_out, body) if len(kept_out) else None
     if recording is None:

@@ -76,8 +76,8 @@ def build_recording(campaign: Campaign, run: Run, body: Body | None) -> RobotRec
         stated &= points.covariance is not None
         if len(frames.pose):
             observations.append(frame_observations(points, frames))
-            # Points of the own station share the errors of its cameras and of the surveyed body, which repeat in every
-            # pose: what they tell about targets and cameras is judged where these are adjusted, with their covariance.
+            # What points of the own station tell about targets and cameras is judged in its images (they share the
+            # errors of its cameras); the robot is diagnosed on the frames, which carry that share in their weights.
             own_station = points.station_jacobian is not None
             detailed.append(observations[-1] if own_station else _used_points(points, frames, body) or observations[-1])
     for table in campaign.measurements:

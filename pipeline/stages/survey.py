@@ -17,6 +17,7 @@ from pipeline.stages.detect import DetectionIndex, load_detections, sizes
 from robcal.errors import DegenerateGeometry, InvalidInput, NotIdentifiable, RobcalError
 from robcal.photogrammetry.bodies import Body
 from robcal.photogrammetry.camera import INTRINSIC_NAMES
+from robcal.photogrammetry.colmap_engine import export_colmap
 from robcal.photogrammetry.network import CameraNetwork, Lengths
 from robcal.photogrammetry.survey import BodyTarget, SurveyImage, SurveyResult, survey_body
 
@@ -168,6 +169,8 @@ def _write(run: Run, name: str, source: ImageSource, body: Body, done: SurveyRes
     )
     sigma = np.sqrt(np.clip(np.diag(done.network.intrinsics_covariance), 0, None))
     pixel = source.start.pixel_um if source.start is not None else None
+    run.colmap(name).mkdir(parents=True, exist_ok=True)
+    export_colmap(done.network, run.colmap(name))
     camera = CameraFile(
         done.network.camera, None, pixel, dict(zip(INTRINSIC_NAMES, map(float, sigma), strict=True))
     )
