@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -10,11 +11,13 @@ import numpy as np
 from pipeline.bodies import surveyed_or_given
 from pipeline.campaign import Campaign
 from pipeline.runs import Run
+from pipeline.tables import read_table
 from robcal.diagnosis.image_data import survey_data
 from robcal.diagnosis.image_diagnosis import ImageDiagnosis, ImageFinding, diagnose_images
+from robcal.diagnosis.image_exchange import exchanged_targets
 from robcal.diagnosis.image_station import given_points, station_data
 from robcal.diagnosis.lens_findings import station_findings, survey_findings
-from robcal.photogrammetry.station_network import StationOrientation
+from robcal.photogrammetry.station_network import StationMarks, StationOrientation
 from robcal.photogrammetry.survey_types import SurveyResult
 from robcal.transforms import Array
 
@@ -51,7 +54,12 @@ def images_of(campaign: Campaign, run: Run) -> ImageFindings:
         given = surveyed_or_given(campaign, run, orientation.body.name)
         start = {camera: s.start.camera if s.start else None for camera, s in campaign.cameras.items()}
         data = station_data(orientation, tuple(names), given, start, _covariates(campaign))
-        findings += station_findings(orientation, tuple(names), given_points(orientation, given), data.inflation)
+        marks: dict[str, StationMarks] = run.load("marks")
+        swapped = exchanged_targets(orientation, marks, given)
+        explained = frozenset(str(name) for f in swapped for name in (f.where, f.parameters["with"]))
+        stated = given_points(orientation, given)
+        findings += swapped
+        findings += station_findings(orientation, tuple(names), stated, data.inflation, explained)
         scans.append(diagnose_images(data))
         noise.append(orientation.sigma0)
     for scan in scans:
@@ -60,10 +68,14 @@ def images_of(campaign: Campaign, run: Run) -> ImageFindings:
 
 
 def _covariates(campaign: Campaign) -> Mapping[str, Array]:
-    """Temperatures and hours of all poses."""
+    """Temperatures and hours of all poses (without a robot they are read here: its other columns do not count)."""
     if campaign.poses is None:
         return {}
-    given = campaign.poses.covariates
+    given = dict(campaign.poses.covariates)
+    if campaign.robot is None:
+        table = read_table(campaign.poses.path)
+        wanted = [n for n in table.columns if n == "time_s" or re.fullmatch(r"temp_\w+_c", n)]
+        given = {name: table.numbers(name) for name in wanted}
     found = {name: np.asarray(v, dtype=float) for name, v in given.items() if name.startswith("temp_")}
     if "time_s" in given:
         found["hours"] = np.asarray(given["time_s"], dtype=float) / 3600.0

@@ -9,6 +9,9 @@ from robcal.diagnosis.image_diagnosis import ImageDiagnosis, ImageFinding
 from robcal.diagnosis.next_poses import poses_table
 from robcal.diagnosis.result import Diagnosis, Finding
 
+OF_STATION = frozenset({"camera_moved", "scale_drift", "scale_error"})
+"""Causes of cameras that 3D points show only for the station as a whole."""
+
 
 def as_contract(diagnosis: Diagnosis) -> dict[str, object]:
     """The content of diagnosis.json for a robot's recording."""
@@ -120,11 +123,10 @@ def with_images(
             "p_value": number(min(first.p_value, float(str(robot["p_value"])))),
             "statement": text,
             "location": _place(first),
-            "causes": [*causes, *_listed(robot["causes"])],
+            "causes": [*causes, *_not_among(findings, _listed(robot["causes"]))],
         }
-    before = max(
-        (finding.heldout_px[0] for finding in findings), default=max((s.heldout_px[0] for s in scans), default=0.0)
-    )
+    values = [finding.heldout_px[0] for finding in findings if math.isfinite(finding.heldout_px[0])]
+    before = max(values, default=max((s.heldout_px[0] for s in scans), default=0.0))
     after = max((scan.heldout_px[1] for scan in scans), default=0.0)
     floor = max((scan.heldout_px[2] for scan in scans), default=0.0)
     left = min((scan.unexplained_p for scan in scans), default=1.0)
@@ -150,6 +152,23 @@ def with_images(
 
 def _place(finding: ImageFinding) -> dict[str, object]:
     return {"stage": finding.stage, "where": finding.where, "direction": finding.direction, "poses": []}
+
+
+def _not_among(findings: Sequence[ImageFinding], causes: list[object]) -> list[object]:
+    """Causes of the robot's recording that the images do not tell already (under one of their two numbers if swapped,
+    and for the station as a whole if a camera moved)."""
+
+    def place(cause: str, where: str, parameters: object) -> tuple[str, frozenset[str]]:
+        others = {str(parameters["with"])} if isinstance(parameters, dict) and "with" in parameters else set()
+        return cause, frozenset({"station" if cause in OF_STATION else where, *others})
+
+    known = {place(f.cause, f.where, f.parameters) for f in findings}
+    return [
+        cause
+        for cause in causes
+        if not isinstance(cause, dict)
+        or place(str(cause["cause"]), str(cause["where"]), cause["parameters"]) not in known
+    ]
 
 
 def _listed(causes: object) -> list[object]:

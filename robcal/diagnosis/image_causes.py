@@ -162,7 +162,7 @@ def move_cause(data: ImageData, by: Array, name: str, rows: Array, pose: int, we
         name,
         None,
         only(rows & (data.image >= pose), by),
-        np.array([1e-3, 1e-3, 1e-3, 5e-4, 5e-4, 5e-4]),
+        np.array([2e-4, 2e-4, 2e-4, 1e-4, 1e-4, 1e-4]),
         lambda v: {
             "pose": label,
             "shift_mm": [1e3 * float(x) for x in v[:3]],
@@ -183,7 +183,7 @@ def _targets(data: ImageData, by_target: Array) -> Iterator[ImageCause]:
             str(int(target)),
             None,
             only(data.target == target, by_target),
-            np.array([5e-4, 5e-4, 5e-4]),
+            np.array([1e-4, 1e-4, 1e-4]),
             lambda v: {"shift_mm": [1e3 * float(x) for x in v]},
             "Target {where} sits at another place than its file says, by {shift_mm} mm",
             weight=1.0 / len(present),

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import stats
 
-from robcal.diagnosis.family_wise import simulate
+from robcal.diagnosis.family_wise import FamilyWise, simulate
 from robcal.diagnosis.image_cause import ImageCause
 from robcal.diagnosis.image_causes import image_causes, neighbouring_moves
 from robcal.diagnosis.image_data import ImageData
@@ -83,7 +83,7 @@ def diagnose_images(data: ImageData, *, moves: bool = True, level: float = LEVEL
         first_p = last_p if first_p is None else first_p
         if last_p > level or len(findings) == MOST:
             break
-        chosen, score = _best(causes, result)
+        chosen, score = _best(causes, result, level_of, level)
         near = list(neighbouring_moves(data, causes[chosen])) if causes[chosen].pose is not None else []
         if near:
             more = [Entry(len(causes) + k, 0, data.whiten(c.columns) * c.sizes) for k, c in enumerate(near)]
@@ -91,7 +91,7 @@ def diagnose_images(data: ImageData, *, moves: bool = True, level: float = LEVEL
             stacks = (*stacks, *stack_entries(more, remove))
             inflation = np.concatenate([inflation, np.full(len(near), inflation[chosen])])
             result = scan([_scaled(stack, inflation) for stack in stacks], residual, freedom)
-            chosen, score = _best(causes, result)
+            chosen, score = _best(causes, result, level_of, level)
         cause = causes[chosen]
         basis, values, covariance = _estimate(stacks, chosen, residual, result.variance_factor, cause.sizes)
         left = _without(basis, residual)
@@ -159,10 +159,12 @@ def _predicted(data: ImageData, residual: Array, redundancy: Array) -> float:
     return float(np.sqrt(np.mean((marks[usable] / redundancy[usable]) ** 2))) * data.sigma_px
 
 
-def _best(causes: Sequence[ImageCause], result: ScanResult) -> tuple[int, Array]:
+def _best(causes: Sequence[ImageCause], result: ScanResult, level_of: FamilyWise, level: float) -> tuple[int, Array]:
+    """Candidate with the most evidence, and log-odds (causes,) of all; what is not significant itself is none."""
     score = np.full(len(causes), -np.inf)
-    for index, evidence in zip(result.family, result.log_evidence, strict=True):
-        score[index] = evidence + np.log(causes[index].weight)
+    for index, evidence, log_p in zip(result.family, result.log_evidence, result.log_p, strict=True):
+        if level_of.probability(float(log_p)) <= level:
+            score[index] = evidence + np.log(causes[index].weight)
     return int(np.argmax(score)), score
 
 

@@ -81,6 +81,7 @@ def station_findings(
     pose_names: tuple[str, ...],
     given: Body | None = None,
     inflation: Mapping[str, float] | None = None,
+    explained: frozenset[str] = frozenset(),
 ) -> Iterator[ImageFinding]:
     """Recurring contradictions that the station's adjustment freed, strongest first.
 
@@ -88,6 +89,7 @@ def station_findings(
     ----------
     pose_names : names of all poses. given : the body with the coordinates of its file, to see exchanged targets.
     inflation : cause -> factor by which such scores scatter where nothing is wrong (errors common to an image).
+    explained : targets whose place is explained already.
     """
     rms, marks = orientation.rms_px, len(orientation.marks)
     for item in sorted(_with_swaps(orientation.evidence, given), key=lambda e: -e.statistic):
@@ -96,7 +98,7 @@ def station_findings(
             continue
         statistic = item.statistic / (inflation or {}).get(item.kind, 1.0)
         p_value = float(stats.chi2.sf(statistic, item.degrees))
-        if p_value > LEVEL:
+        if p_value > LEVEL or (item.kind == "target_shifted" and item.where in explained):
             continue
         before = float(np.sqrt(rms**2 * (1.0 + item.statistic / (2 * marks)))) if np.isfinite(statistic) else np.nan
         rivals: tuple[tuple[str, str], ...] = ()
