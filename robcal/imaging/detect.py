@@ -21,6 +21,7 @@ from robcal.imaging.settings import DetectionSettings
 Array = NDArray[np.float64]
 
 _DEFAULT = DetectionSettings()
+_CODED_MISFIT_MAX = 0.1
 
 
 def detect_targets(image: NDArray, settings: DetectionSettings = _DEFAULT) -> Detections:
@@ -152,6 +153,7 @@ def _readings(
         none = np.zeros(n, bool)
         return RingReadings(np.full(n, -1, np.int64), none, np.zeros(n), np.zeros((n, 12), bool), np.zeros(n))
     sigma = np.sqrt(noise.at(dots.background + 0.5 * dots.contrast))
+    sigma = np.where(dots.misfit < _CODED_MISFIT_MAX, sigma, np.inf)  # not clean enough to carry a code
     return read_rings(
         image, dots.xy, dots.b, dots.s, dots.background, dots.contrast, sigma, saturation, settings.known_codes
     )

@@ -92,7 +92,7 @@ def fit_dots(
     max_misfit : fits with three times this misfit (by contrast) after the first round are given up.
     """
     groups, fits = _first_round(image, candidates, noise, saturation, max_misfit)
-    clean = [without_doubt(window, fit, max_misfit) for window, fit in zip(groups, fits, strict=True)]
+    clean = [without_doubt(window, fit) for window, fit in zip(groups, fits, strict=True)]
     noise = noise_inside(groups, fits, clean, noise_around(groups, fits, clean, noise))
     fits = [iterate(fit, window, noise, 2, tolerance=0.05) for window, fit in zip(groups, fits, strict=True)]
     shading, prior = shading_priors(groups, fits)

@@ -14,14 +14,15 @@ from robcal.imaging.windows import Windows
 
 Array = NDArray[np.float64]
 
+_CLEAN_RESIDUAL = 0.06  # RMS residual by contrast of a dot that tells about noise
 _SHADING_TOLD = 0.02  # sigma of a dot's relative gradient per radius above which it cannot tell shading from shift
 
 
-def without_doubt(window: Windows, fit: EllipseFits, max_misfit: float) -> NDArray[np.bool_]:
+def without_doubt(window: Windows, fit: EllipseFits) -> NDArray[np.bool_]:
     """(n,) fits that are dots without doubt: only these tell about the image's noise."""
     used = np.maximum((fit.weight > 0).sum(axis=1), 1)
     rms = np.sqrt(np.where(fit.weight > 0, fit.residual**2, 0.0).sum(axis=1) / used)
-    return fit.converged & (rms < max_misfit * np.abs(fit.parameters[:, 9])) & (used > 24)
+    return fit.converged & (rms < _CLEAN_RESIDUAL * np.abs(fit.parameters[:, 9])) & (used > 24)
 
 
 def noise_around(
@@ -96,7 +97,8 @@ def noise_correlation(groups: list[Windows], fits: list[EllipseFits], clean: lis
     lag_one = product[use] / square[use]
     order = np.argsort(lag_one)
     weight = np.cumsum(square[use][order])
-    kept = order[(weight > 0.25 * weight[-1]) & (weight <= 0.75 * weight[-1])] if len(order) >= 8 else order
+    middle = (weight > 0.25 * weight[-1]) & (weight <= 0.75 * weight[-1])
+    kept = order[middle] if middle.sum() >= 4 else order
     return correlation_factor(float(product[use][kept].sum() / square[use][kept].sum()))
 
 

@@ -94,6 +94,8 @@ def without_duplicates(dots: FittedDots, readings: RingReadings, log: RejectionL
     if n < 2:
         return dots, readings
     order = np.lexsort((dots.misfit + dots.residual, readings.code < 0))
+    rank = np.empty(n, int)
+    rank[order] = np.arange(n)
     tree = cKDTree(dots.xy)
     keep = np.ones(n, bool)
     reach = np.where(readings.code >= 0, 3.1, 0.9) * dots.semi_axes[:, 0]
@@ -102,6 +104,14 @@ def without_duplicates(dots: FittedDots, readings: RingReadings, log: RejectionL
             continue
         for other in tree.query_ball_point(dots.xy[row], reach[row]):
             if other == row or not keep[other]:
+                continue
+            if rank[other] < rank[row]:
+                # a better dot stands inside this one's outline: this is its glare or the plate that carries it
+                inside = np.hypot(*(dots.xy[other] - dots.xy[row])) + dots.semi_axes[other, 0] < dots.semi_axes[row, 0]
+                if inside and readings.code[row] < 0:
+                    keep[row] = False
+                    log.add(dots.xy[row, 0], dots.xy[row, 1], dots.semi_axes[row, 0], Reason.TOO_LARGE)
+                    break
                 continue
             rho = _relative_radius(
                 dots.xy[other : other + 1], dots.xy[row], dots.semi_axes[row], float(dots.angle[row])

@@ -9,7 +9,9 @@ from robcal.imaging.noise import NoiseModel
 from tests.imaging.rendering import Dot, render
 
 
-@pytest.mark.parametrize(("a", "b", "angle"), [(1.0, 1.0, 0.0), (1.5, 0.8, 0.5), (3.0, 3.0, 0.0), (6.0, 3.5, 0.7), (12.0, 9.0, 2.0)])
+@pytest.mark.parametrize(
+    ("a", "b", "angle"), [(1.0, 1.0, 0.0), (1.5, 0.8, 0.5), (3.0, 3.0, 0.0), (6.0, 3.5, 0.7), (12.0, 9.0, 2.0)]
+)
 def test_bound_agrees_with_brute_force(a: float, b: float, angle: float) -> None:
     noise = NoiseModel(2.0, 0.04, 15.0)
     contrast, background, blur, size = 150.0, 15.0, 0.8, int(2 * a + 16)
