@@ -15,7 +15,9 @@ class ImageCause:
     """A candidate: where it acts, its columns, the typical size of its parameters, and how they are told.
 
     `plausible` refuses estimates that physics forbids; `least_gain` is the share by which the prediction of marks must
-    improve for the cause to be worth a name; `twins` are (cause, where) of others with the very same columns.
+    improve for the cause to be worth a name; `twins` are (cause, where) of others with the very same columns; `pose`
+    the first image of a moved camera; `bends`: told from a smooth field over the image only by its form; `once`: the
+    other candidates of that name and place are the same cause with other constants.
     """
 
     cause: str
@@ -31,6 +33,8 @@ class ImageCause:
     least_gain: float = 0.0
     twins: tuple[tuple[str, str], ...] = ()
     pose: int | None = None
+    bends: bool = False
+    once: bool = True
 
 
 def only(rows: Array, values: Array) -> Array:

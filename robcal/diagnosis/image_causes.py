@@ -92,6 +92,7 @@ def _eccentricity(data: ImageData, c: int, name: str, rows: Array) -> Iterator[I
         np.array([1e-4]),
         lambda v: {"diameter_mm": 2e3 * float(np.sqrt(max(v[0], 0.0)))},
         "Dots seen obliquely by {where} show off their centres as dots of {diameter_mm:.1f} mm do",
+        bends=True,
         plausible=lambda v: float(v[0]) > 0,
     )
 
@@ -171,6 +172,7 @@ def move_cause(data: ImageData, by: Array, name: str, rows: Array, pose: int, we
         "Camera {where} moved before pose {pose}",
         weight=weight,
         pose=pose,
+        once=False,
     )
 
 

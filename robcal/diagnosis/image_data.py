@@ -35,8 +35,8 @@ class ImageData:
     by_exterior : (m, 2, 6) px by the camera's own exterior orientation, None for a survey.
     by_target : (m, 2, 3) px by the target's body coordinates, None where they are plain unknowns.
     p_body : (m, 3) the targets about their centroid. body : its name.
-    free : per camera the numbers of the interior orientation that are adjusted or in no file at all (`f_only`: fx and fy
-        change alike), so that their lack is no cause.
+    free : per camera the numbers of the interior orientation whose lack is no cause: adjusted ones, and all where no
+        file states any (`f_only`: fx and fy change alike).
     radii : (m,) m of the dots as modelled, 0 where the eccentricity is not. dots : whether the targets are round dots.
     sigma_px : typical standard deviation of a coordinate.
     covariates : per mark, change since the first pose: `temp_<place>_c` in K, `hours` in h.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,7 +12,7 @@ from robcal.diagnosis.family_wise import FamilyWise, simulate
 from robcal.diagnosis.image_cause import ImageCause
 from robcal.diagnosis.image_causes import image_causes, neighbouring_moves
 from robcal.diagnosis.image_data import ImageData
-from robcal.diagnosis.scan import Entry, ScanResult, Stack, scan, stack_entries
+from robcal.diagnosis.scan import Entry, ScanResult, Stack, log_f_probability, orthonormal_basis, scan, stack_entries
 from robcal.physics.family import Array
 
 LEVEL = 0.01
@@ -20,6 +20,10 @@ MOST = 5
 RUNS = 200
 NEARLY_AS_GOOD = 3.0
 """Logarithm of the odds within which another cause stays a rival."""
+ADEQUATE = 1e-3
+LEFT_OVER = 0.2
+"""Significance of a smooth field beside a named cause, and its share of what that explains, from which the name does
+not hold."""
 
 
 @dataclass(frozen=True)
@@ -64,11 +68,11 @@ def diagnose_images(data: ImageData, *, moves: bool = True, level: float = LEVEL
     residual, added = data.residual, np.zeros((len(data.residual), 0))
     redundancy = data.redundancy.reshape(-1).copy()
     findings: list[ImageFinding] = []
-    first_p: float | None = None
     predicted = _predicted(data, residual, redundancy)
     before = predicted
     level_of = None
-    last_p = 1.0
+    fields: dict[str, Array] = {}
+    last_p = dropped_p = 1.0
     while listed and len(findings) <= MOST:
 
         def remove(columns: Array, basis: Array = added) -> Array:
@@ -78,9 +82,9 @@ def diagnose_images(data: ImageData, *, moves: bool = True, level: float = LEVEL
         freedom = data.freedom - added.shape[1]
         inflation = _inflation(causes, stacks, data, residual)
         result = scan([_scaled(stack, inflation) for stack in stacks], residual, freedom)
+        fields = fields or _fields(causes, stacks)
         level_of = level_of or simulate(stacks, remove, freedom, len(residual), runs=RUNS, seed=seed)
         last_p = level_of.probability(float(result.log_p[result.best]))
-        first_p = last_p if first_p is None else first_p
         if last_p > level or len(findings) == MOST:
             break
         chosen, score = _best(causes, result, level_of, level)
@@ -97,7 +101,9 @@ def diagnose_images(data: ImageData, *, moves: bool = True, level: float = LEVEL
         left = _without(basis, residual)
         remaining = np.maximum(redundancy - np.sum(basis[: len(redundancy)] ** 2, axis=1), 1e-3)
         after = _predicted(data, left, remaining)
-        if not cause.plausible(values) or after > (1.0 - cause.least_gain) * predicted:
+        gained = after <= (1.0 - cause.least_gain) * predicted
+        if not (cause.plausible(values) and gained and _adequate(fields, cause, basis, residual, freedom)):
+            dropped_p = min(dropped_p, last_p)
             listed = [entry for entry in listed if entry.family != chosen]
             continue
         residual, redundancy = left, remaining
@@ -116,10 +122,42 @@ def diagnose_images(data: ImageData, *, moves: bool = True, level: float = LEVEL
                 _sentence(cause, told),
             )
         )
+        if cause.once:
+            same = {i for i, c in enumerate(causes) if (c.cause, c.where) == (cause.cause, cause.where)}
+            listed = [entry for entry in listed if entry.family not in same]
         predicted = after
         added = np.concatenate([added, basis], axis=1)
     floor = data.sigma_px
-    return ImageDiagnosis(tuple(findings), first_p if first_p is not None else 1.0, last_p, (before, predicted, floor))
+    p_value = findings[0].p_value if findings else last_p
+    return ImageDiagnosis(tuple(findings), p_value, min(last_p, dropped_p), (before, predicted, floor))
+
+
+def _adequate(
+    fields: Mapping[str, Array], cause: ImageCause, basis: Array, residual: Array, freedom: int
+) -> bool:
+    """Whether a smooth field over the camera's image finds nothing beside a cause that bends images itself.
+
+    What a lens model leaves over looks partly like refraction; the name holds only if it explains (nearly) all of it.
+    """
+    if not cause.bends or cause.where not in fields:
+        return True
+    explained = float(np.sum((basis.T @ residual) ** 2))
+    left = _without(basis, residual)
+    beside = orthonormal_basis(_without(basis, fields[cause.where]))
+    raw, count = float(np.sum((beside.T @ left) ** 2)), beside.shape[1]
+    total = float(left @ left)
+    log_p = float(log_f_probability(np.array(raw), np.array(count), total, freedom - basis.shape[1]))
+    return log_p > np.log(ADEQUATE) or raw - count < LEFT_OVER * explained
+
+
+def _fields(causes: Sequence[ImageCause], stacks: Sequence[Stack]) -> dict[str, Array]:
+    """Orthonormal columns of the smooth field of each camera, beside what the images' unknowns absorb."""
+    return {
+        causes[index].where: stack.basis[e]
+        for stack in stacks
+        for e, index in enumerate(stack.family)
+        if causes[index].cause == "unknown" and stack.count[e] > 0
+    }
 
 
 def _inflation(causes: Sequence[ImageCause], stacks: Sequence[Stack], data: ImageData, residual: Array) -> Array:

@@ -42,6 +42,7 @@ def refraction_causes(data: ImageData, c: int, name: str, rows: Array) -> Iterat
             lambda v: {"index": GLASS, "thickness_mm": 1e3 * float(v[0])},
             "Camera {where} looks through a window that acts like {thickness_mm:.1f} mm of glass",
             weight=0.5 / len(normals),
+            bends=True,
             plausible=lambda v: 0.0 < float(v[0]) < THICKEST,
         )
     body_axes = data.camera_R_body.swapaxes(1, 2)
@@ -61,6 +62,7 @@ def refraction_causes(data: ImageData, c: int, name: str, rows: Array) -> Iterat
             lambda v: {"index": float(1.0 / max(1.0 - v[0], 1e-3))},
             "Camera {where} looks through a boundary of media (apparent index {index:.3f})",
             weight=0.25 / len(directions),
+            bends=True,
             plausible=lambda v: 0.03 < abs(float(v[0])) < 0.6,
         )
 
