@@ -17,6 +17,7 @@ from robcal.errors import InvalidInput
 from robcal.photogrammetry.bodies import Body
 from robcal.photogrammetry.measure_frames import MeasuredFrames, measure_frames
 from robcal.photogrammetry.measured_points import MeasuredPoints
+from robcal.photogrammetry.point_faults import length_ratio, mirrored, unit_fault
 from robcal.transforms import Array, xyzrpy_from_frame
 
 NAME = "frames"
@@ -36,6 +37,7 @@ def work(context: Context) -> Outcome:
         raise InvalidInput(f"{campaign.path}: no poses: add 'poses: poses.csv'")
     points: MeasuredPoints = run.load("points")
     body = _body(campaign, run)
+    _check_points(campaign, points, body)
     tolerance = campaign.entry.quality.distance_tolerance_mm
     frames = measure_frames(points, body, tolerance=None if tolerance is None else tolerance / 1000)
     write_frames(run, campaign.poses, frames)
@@ -45,6 +47,33 @@ def work(context: Context) -> Outcome:
     if frames.recurring.pairs or frames.recurring.scale_ppm is not None:
         notes.append(f"recurring length deviations, evidence for the diagnosis: {frames.recurring.statement}")
     return Outcome({"points": _result(points, frames)}, outputs, notes)
+
+
+def _check_points(campaign: Campaign, points: MeasuredPoints, body: Body | None) -> None:
+    """Refuse points in a wrong unit, and points that mirror the body.
+
+    Raises
+    ------
+    InvalidInput : one of both, with the proof.
+    """
+    if body is None:
+        return
+    tables = [t.path for t in campaign.measured("points")]
+    where = tables[0] if tables else campaign.path
+    rows = (points.pose, points.target, points.p_world, body)
+    ratio = length_ratio(*rows)
+    if ratio is not None and unit_fault(ratio):
+        raise InvalidInput(
+            f"{where}: lengths between targets are measured {ratio:.3g} times as long as on body '{body.name}': "
+            "coordinates in columns and keys _mm must be in millimetres, check the unit of both files"
+        )
+    found = mirrored(*rows)
+    if found is not None:
+        raise InvalidInput(
+            f"{where}: the measured points are a mirror image of body '{body.name}' (it misses them by "
+            f"{found[0] * 1000:.3g} mm, their mirror image by {found[1] * 1000:.3g} mm): two coordinate columns are "
+            "exchanged, one has the wrong sign, or a system is left-handed; correct the points or the body file"
+        )
 
 
 def _body(campaign: Campaign, run: Run) -> Body | None:

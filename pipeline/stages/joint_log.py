@@ -17,6 +17,8 @@ _REMEDIES = {
     "exchanged_columns": "exchange the two columns",
     "wrong_sign": "change 'sign' of this joint in the robot file",
     "wrong_unit": "write degrees into the columns _deg",
+    "measured_columns": "correct the columns of the measurements",
+    "measured_unit": "write degrees into the columns _deg of the measurements",
 }
 
 

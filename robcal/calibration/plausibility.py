@@ -7,14 +7,15 @@ decimetres. So the nominal robot with the best base and tool is enough to tell.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
+from robcal import transforms as tf
 from robcal.calibration.identification import start_state
-from robcal.calibration.observations import Observations, Stack
+from robcal.calibration.observations import FrameObservations, Observations, PointObservations, Stack
 from robcal.calibration.problem import Evaluator
 from robcal.errors import RobcalError
 from robcal.robot.kernel import Kernel, PoseInputs
@@ -27,6 +28,8 @@ SUSPICIOUS_SHARE = 0.01
 PROOF = 0.25
 """A cause is likely if mending it lowers the miss below this share."""
 
+_SIX = ("x", "y", "z", "roll", "pitch", "yaw")
+
 
 @dataclass(frozen=True)
 class LikelyCause:
@@ -34,8 +37,9 @@ class LikelyCause:
 
     Attributes
     ----------
-    kind : 'slipped_rows', 'exchanged_columns', 'wrong_sign' or 'wrong_unit'.
-    where : what it concerns ('axis2', 'axis1 and axis3', 'from row 17', 'all joints').
+    kind : 'slipped_rows', 'exchanged_columns', 'wrong_sign' or 'wrong_unit' of the joint log, 'measured_columns' or
+        'measured_unit' of the measurements.
+    where : what it concerns ('axis2', 'axis1 and axis3', 'from row 17', 'all joints', 'measurements').
     statement : one sentence with the proof.
     rms_before, rms_after : miss of the nominal robot with the best base and tool, m (angles by a lever of one metre).
     """
@@ -134,6 +138,7 @@ def _repairs(
         new[:, [i, k]] = q[:, [k, i]]
         yield "exchanged_columns", f"{names[i]} and {names[k]}", f"the columns of joints {i + 1} and {k + 1} are " \
             "exchanged", with_q(new)
+    yield from _measurement_repairs(poses, observations)
     for shift in (1, -1, 2, -2):
         yield "slipped_rows", "all rows", f"the joint log is slipped by {abs(shift)} row(s) against the measurements " \
             f"({'late' if shift > 0 else 'early'})", _slip(poses, observations, 0, n, shift)
@@ -143,6 +148,46 @@ def _repairs(
                 f"row against the measurements ({'late' if shift > 0 else 'early'})", _slip(
                 poses, observations, start, n, shift
             )
+
+
+def _measurement_repairs(poses: PoseInputs, observations: Sequence[Observations]) -> Iterator[Repair]:
+    """Columns of the measurements that are exchanged, have the wrong sign or unit."""
+
+    def mended(change: Callable[[Observations], Observations]) -> Callable[[], tuple[PoseInputs, list[Observations]]]:
+        return lambda: (poses, [change(o) for o in observations])
+
+    def of_frames(change: Callable[[Array], Array]) -> Callable[[Observations], Observations]:
+        def apply(o: Observations) -> Observations:
+            if not isinstance(o, FrameObservations):
+                return o
+            return replace(o, world_T_tool=tf.frame_from_xyzrpy(change(tf.xyzrpy_from_frame(o.world_T_tool))))
+
+        return apply
+
+    kind, where = "measured_columns", "measurements"
+    if any(isinstance(o, FrameObservations) for o in observations):
+        for i, k in ((0, 1), (0, 2), (1, 2), (3, 5)):
+            order = np.arange(6)
+            order[[i, k]] = k, i
+            words = f"the measured {_SIX[i]} and {_SIX[k]} are exchanged"
+            yield kind, where, words, mended(of_frames(lambda six, order=order: six[:, order]))  # type: ignore[misc]
+        for i in range(6):
+            signs = np.where(np.arange(6) == i, -1.0, 1.0)
+            words = f"the measured {_SIX[i]} has the wrong sign"
+            yield kind, where, words, mended(of_frames(lambda six, signs=signs: six * signs))  # type: ignore[misc]
+        for factor, words in (
+            (180 / np.pi, "the measured angles are in radians where degrees are expected"),
+            (np.pi / 180, "the measured angles are in degrees where radians are expected"),
+        ):
+            scale = np.where(np.arange(6) < 3, 1.0, factor)
+            yield "measured_unit", where, words, mended(of_frames(lambda six, s=scale: six * s))  # type: ignore[misc]
+    if any(isinstance(o, PointObservations) for o in observations):
+        words = "the measured points are mirrored (two columns exchanged, or one with the wrong sign)"
+
+        def mirror(o: Observations) -> Observations:
+            return replace(o, p_world=o.p_world * [1.0, 1.0, -1.0]) if isinstance(o, PointObservations) else o
+
+        yield kind, where, words, mended(mirror)
 
 
 def _slip(

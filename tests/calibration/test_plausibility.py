@@ -11,6 +11,7 @@ from robcal.calibration.observations import Observations, PointObservations
 from robcal.calibration.plausibility import likely_causes, outside_limits
 from robcal.robot.kernel import Kernel
 from robcal.robot.model import Frame
+from robcal.transforms import frame_from_xyzrpy, xyzrpy_from_frame
 from tests.calibration.scenarios import Scenario, scenario
 from tests.robot.chains import kr_like
 
@@ -75,3 +76,34 @@ def test_limits() -> None:
     kernel = Kernel(model)
     assert outside_limits(model, kernel.poses([[0.5] * 6, [1.5] + [0.0] * 5])) == [(1, "axis1", 1.5)]
     assert isinstance(frames[0], Frame)
+
+
+def _read_wrongly(six: np.ndarray, what: str) -> np.ndarray:
+    out = six.copy()
+    if what == "x and y":
+        out[:, [0, 1]] = six[:, [1, 0]]
+    elif what == "roll and yaw":
+        out[:, [3, 5]] = six[:, [5, 3]]
+    elif what == "z has the wrong sign":
+        out[:, 2] *= -1
+    elif what == "radians":
+        out[:, 3:] = np.deg2rad(six[:, 3:])
+    return out
+
+
+@pytest.mark.parametrize("what", ["x and y", "roll and yaw", "z has the wrong sign", "radians"])
+def test_columns_of_measured_frames(what: str) -> None:
+    s = scenario(11)
+    frames = s.frames(s.poses)
+    six = _read_wrongly(xyzrpy_from_frame(frames.world_T_tool), what)
+    causes = likely_causes(s.model, s.poses, [replace(frames, world_T_tool=frame_from_xyzrpy(six))], s.kernel)
+    assert causes[0].kind == ("measured_unit" if what == "radians" else "measured_columns")
+    assert what in causes[0].statement
+
+
+def test_mirrored_points() -> None:
+    s = scenario(11)
+    (points,) = _observed(s, "points")
+    assert isinstance(points, PointObservations)
+    causes = likely_causes(s.model, s.poses, [replace(points, p_world=points.p_world[:, [1, 0, 2]])], s.kernel)
+    assert causes[0].kind == "measured_columns"

@@ -89,3 +89,23 @@ def test_unknown_parameter_name(frame_campaign: Path, tmp_path: Path) -> None:
     edit_yaml(frame_campaign / "campaign.yaml", lambda d: d.update(model={"parameters": ["axis2.pich"]}))
     with pytest.raises(InvalidInput, match=r"axis2\.pich"):
         run_campaign(frame_campaign, tmp_path / "run", until="identify")
+
+
+def metres(rows: Rows) -> None:
+    for row in rows:
+        row.update({name: str(float(row[name]) / 1000) for name in ("x_mm", "y_mm", "z_mm")})
+
+
+def mirror(rows: Rows) -> None:
+    for row in rows:
+        row["x_mm"], row["y_mm"] = row["y_mm"], row["x_mm"]
+
+
+@pytest.mark.parametrize(("fault", "words"), [(metres, ["0.001 times", "millimetres"]), (mirror, ["mirror image"])])
+def test_faults_of_all_points(point_campaign: Path, tmp_path: Path, fault, words: list[str]) -> None:  # type: ignore[no-untyped-def]
+    edit_rows(point_campaign / "points.csv", fault)
+    with pytest.raises(InvalidInput) as error:
+        run_campaign(point_campaign, tmp_path / "run", until="identify")
+    assert "points.csv" in str(error.value)
+    for word in words:
+        assert word in str(error.value)
