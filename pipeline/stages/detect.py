@@ -24,6 +24,9 @@ NAME = "detect"
 CODE = ("robcal/imaging", "robcal/errors.py", "pipeline/images.py", "pipeline/stages/detect.py")
 
 
+_MANY = 12
+
+
 @dataclass(frozen=True)
 class ImageEntry:
     """What became of one image.
@@ -103,6 +106,8 @@ def settings_for(body: BodyFile, survey: SurveyEntry | None) -> DetectionSetting
         ring12=bool(known) or not any(codes),
         known_codes=frozenset(known) if ring else None,
         aruco=dictionaries[0] if dictionaries else None,
+        # many uncoded dots are found by their arrangement: then a rough centre is better than none
+        coarse=survey is None and not any(codes) and len(codes) >= _MANY,
     )
 
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from robcal.errors import InvalidInput
 from robcal.imaging.aruco_markers import find_markers
 from robcal.imaging.blobs import step_all_around
+from robcal.imaging.coarse_dots import with_coarse_dots
 from robcal.imaging.detections import CodeState, Detections, Reason, RejectionLog, TargetKind, empty_columns
 from robcal.imaging.dot_fitting import FittedDots, blur_without_pixel, fit_dots, refit_coded
 from robcal.imaging.noise import NoiseModel, estimate_noise
@@ -21,6 +22,7 @@ from robcal.imaging.settings import DetectionSettings
 Array = NDArray[np.float64]
 
 _DEFAULT = DetectionSettings()
+_ODD = (Reason.SHAPE, Reason.STRUCTURE, Reason.NO_CONVERGENCE, Reason.OVER_CAP)
 _CODED_MISFIT_MAX = 0.1
 
 
@@ -74,7 +76,10 @@ def detect_targets(image: NDArray, settings: DetectionSettings = _DEFAULT) -> De
     found = replace(
         noise, gain=abs(bright_noise.gain), variance=bright_noise.variance, correlation=bright_noise.correlation
     )
-    return _detections(image, columns, found, log, "" if len(columns["xy"]) else _no_target(log))
+    result = _detections(image, columns, found, log, "" if len(columns["xy"]) else _no_target(log))
+    if settings.coarse and sum(log.result().counts.get(reason, 0) for reason in _ODD) > len(result):
+        return with_coarse_dots(image, result, polarity=settings.polarity)
+    return result
 
 
 def _check(image: NDArray) -> None:

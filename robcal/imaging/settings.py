@@ -26,6 +26,8 @@ class DetectionSettings:
     known_codes : the ring12 ids that can occur; any other reading is then no code. None: any.
     aruco : OpenCV dictionary of square markers to look for, as "4X4_50" or "DICT_4X4_50"; None: none.
     saturation_level : grey value from which a pixel counts as saturated; None: found from the image.
+    coarse : where most candidates are refused, add coarse dots (:mod:`robcal.imaging.coarse_dots`), for bodies that
+        geometry identifies.
     max_candidates : cap on the blobs that are fitted; those of most contrast are kept.
     """
 
@@ -39,6 +41,7 @@ class DetectionSettings:
     known_codes: frozenset[int] | None = None
     aruco: str | None = None
     saturation_level: float | None = None
+    coarse: bool = False
     max_candidates: int = 4000
 
     def __post_init__(self) -> None:
