@@ -15,7 +15,15 @@ from scipy.spatial import cKDTree
 from robcal.photogrammetry.bodies import Body, IntArray
 from robcal.photogrammetry.camera import Camera
 from robcal.photogrammetry.identify_congruence import congruences
-from robcal.photogrammetry.identify_grow import Grown, View, grow, log_odds, rough_scores, usual_error
+from robcal.photogrammetry.identify_grow import (
+    Grown,
+    View,
+    grow,
+    log_odds,
+    rough_scores,
+    usual_error,
+    without_stragglers,
+)
 from robcal.photogrammetry.identify_rows import body_rows, image_rows, row_hypotheses
 from robcal.transforms import Array, invert
 
@@ -23,6 +31,8 @@ _MIN_TARGETS = 12
 _SAME = 7.0
 """Difference of log odds below which two numberings cannot be told apart (odds of 1000 to 1)."""
 _GROWN = 12
+_FEWEST = 0.35
+"""Share of the body's targets that must be seen."""
 _REASON = "the dots show no rows that fit the body's rows"
 
 
@@ -53,7 +63,6 @@ def search_grid(
     tolerance = model_error_px + 2.0
     best: Grown | None = None
     top = -np.inf
-    why = _REASON
     for poses, used in row_hypotheses(camera, xy, points, rows, chains, tolerance):
         own = _like(size, contrast, used)
         tree = cKDTree(xy[own])
@@ -66,13 +75,15 @@ def search_grid(
             value = log_odds(found, points, sigma=usual_error(found.off), density=density)
             if value > top:
                 top, best = value, _renumbered(found, own)
-        if best is not None:
-            believed, why = _believed(best, len(points), top)
-            if believed:
-                break
-    if best is None or not _believed(best, len(points), top)[0]:
+        # half of a body is no accident; with less, other rows of the image may show more of it
+        if best is not None and len(best.dots) >= 0.5 * len(points) and _believed(best, len(points), top)[0]:
+            break
+    if best is None:
+        return [], _REASON
+    believed, why = _believed(best, len(points), top)
+    if not believed:
         return [], why
-    return _with_rivals(xy, size, contrast, points, best, tolerance, others), ""
+    return _with_rivals(camera, xy, size, contrast, points, best, tolerance, others), ""
 
 
 def _like(size: Array, contrast: Array, used: IntArray) -> IntArray:
@@ -95,15 +106,18 @@ def _density(matched: Array, like: Array) -> float:
 
 
 def _believed(found: Grown, n: int, value: float) -> tuple[bool, str]:
-    """Enough dots, and log odds beyond all hypotheses that could have been tried (a million and a margin)."""
-    enough = len(found.dots) >= max(8, 0.3 * n)
-    if enough and value > np.log(1e6) + _SAME:
+    """Enough dots, and log odds beyond all hypotheses that could have been tried (a million and a margin).
+
+    Five dots' worth of odds is spent on pose and lens.
+    """
+    kept = len(without_stragglers(found).dots)
+    if kept >= max(8, _FEWEST * n) and value * (1.0 - 5.0 / kept) > np.log(1e6) + _SAME:
         return True, ""
-    return False, f"only {len(found.dots)} of {n} targets fit the rows of dots in the image"
+    return False, f"only {kept} of {n} targets fit the rows of dots in the image"
 
 
 def _with_rivals(
-    xy: Array, size: Array, contrast: Array, points: Array, best: Grown, tolerance: float,
+    camera: Camera, xy: Array, size: Array, contrast: Array, points: Array, best: Grown, tolerance: float,
     others: Sequence[View],
 ) -> list[Grown]:
     """The best numbering, after trying all that the body's shape allows, and those it does not clearly beat."""
@@ -112,12 +126,9 @@ def _with_rivals(
     pool = [best]
     for motion in congruences(points, best.targets):
         start = best.camera_T_body @ invert(motion)
-        rival = grow(best.camera, start, points, xy[own], reach=tolerance, tree=tree)
+        rival = grow(camera, start, points, xy[own], reach=tolerance, tree=tree, lens=best.camera)
         if rival is not None:
             pool.append(_renumbered(rival, own))
-    again = grow(best.camera, best.camera_T_body, points, xy[own], reach=tolerance, tree=tree)
-    if again is not None:
-        pool[0] = _renumbered(again, own)
     sigma = min(usual_error(f.off) for f in pool if len(f.dots) >= 0.9 * max(len(g.dots) for g in pool))
     density = _density(xy[best.dots], xy[own])
     value = [log_odds(f, points, sigma=sigma, density=density, others=others) for f in pool]
@@ -130,4 +141,4 @@ def _with_rivals(
         differs = any(numbers.get(int(d), int(t)) != int(t) for d, t in zip(f.dots, f.targets, strict=True))
         if differs and value[k] > value[order[0]] - _SAME:
             out.append(f)
-    return out
+    return [without_stragglers(f) for f in out]

@@ -1,4 +1,4 @@
-"""From a rough pose to all dots it explains: match, refine pose, focal length and k1, match again."""
+"""From a rough pose to all dots it explains: match, refine pose, lens, match again."""
 
 from __future__ import annotations
 
@@ -15,10 +15,13 @@ from robcal.photogrammetry.camera import INTRINSIC_NAMES, Camera, project, proje
 from robcal.transforms import Array, retract, skew, transform
 
 _SIGMA_LOG_FOCAL = 0.15
-_CORNER_DISTORTION = 0.03
-"""Prior standard deviation of the radial distortion in the image corner, as a share of the radius there."""
+_RADIAL, _DECENTRED = 0.03, 0.003
+"""Prior standard deviations of the distortions in the image corner, as shares of the radius there."""
+_AT = {name: k for k, name in enumerate(INTRINSIC_NAMES)}
 _LAST_GATE = 2.5
 """Narrowest gate, px: centres of dots seen through water or lit from the side have errors with long tails."""
+_BY_CHANCE = 0.015
+"""Share of false dots within the last gate that is tolerable."""
 _NEIGHBOURS = 6
 """Targets around one from which its chance to be seen is taken."""
 _OTHER = 3.0
@@ -27,7 +30,7 @@ _OTHER = 3.0
 
 @dataclass(frozen=True)
 class Grown:
-    """A numbering: rows of dots and of targets, pose, camera with adjusted focal length and k1, residuals (k,) px."""
+    """A numbering: rows of dots and of targets, pose, camera with adjusted lens, residuals (k,) px."""
 
     dots: IntArray
     targets: IntArray
@@ -42,14 +45,18 @@ class Grown:
 
 
 def grow(
-    camera: Camera, camera_T_body: Array, points: Array, xy: Array, *, reach: float, tree: cKDTree | None = None
+    camera: Camera, camera_T_body: Array, points: Array, xy: Array, *, reach: float, tree: cKDTree | None = None,
+    lens: Camera | None = None,
 ) -> Grown | None:
     """Match and refine until the matches stay, the gate following the residuals from ``reach`` (px) downwards.
 
-    Returns None where fewer than six dots, or dots in one line only, are left.
+    The gate stays so wide that systematic errors no lens explains do not cut off whole parts of the body, as far as
+    the dots ``xy`` are sparse enough for it. ``lens`` is the camera that belongs to the pose, if adjusted already. Returns None where fewer than six dots, or dots in one line, are left.
     """
     tree = cKDTree(xy) if tree is None else tree
-    pose, lens, gate = camera_T_body, camera, reach
+    extent = float(np.prod(np.maximum(np.ptp(xy, axis=0), 1.0)))
+    last = float(np.clip(np.sqrt(_BY_CHANCE * extent / (np.pi * len(xy))), _LAST_GATE, max(_LAST_GATE, reach)))
+    pose, lens, gate = camera_T_body, camera if lens is None else lens, reach
     before: Grown | None = None
     for step in range(10):
         predicted = project(lens, transform(pose, points))
@@ -62,7 +69,7 @@ def grow(
         now = Grown(dots, targets, pose, lens, off)
         steady = before is not None and np.array_equal(dots, before.dots) and np.array_equal(targets, before.targets)
         usual = 1.4 * float(np.median(off))
-        smaller = max(min(3.0 * usual, 0.75 * gate if step < 5 else gate), _LAST_GATE)
+        smaller = max(min(3.0 * usual, 0.75 * gate if step < 5 else gate), last)
         if steady and smaller >= 0.95 * gate:
             return now
         gate, before = smaller, now
@@ -72,47 +79,49 @@ def grow(
 def refine_with_lens(
     start: Camera, camera: Camera, camera_T_body: Array, points: Array, xy: Array, *, scale: float, iterations: int = 15
 ) -> tuple[Array, Camera]:
-    """Pose, common focal factor and k1 of one image from matched dots (robust: Cauchy weights of width ``scale`` px).
+    """Pose, common focal factor, k1, p1 and p2 of one image from matched dots (Cauchy weights of width ``scale`` px).
 
-    Focal factor and k1 are held to ``start`` by weak priors, since one image of a flat body hardly separates them from
-    the distance. Returns camera_T_body and the camera.
+    The four numbers of the lens are held to ``start`` by weak priors, since one image of a rather flat body hardly
+    separates them from the pose; p1 and p2 also take up a tilted pane. Returns camera_T_body and the camera.
     """
     corner = np.hypot(start.width / start.fx, start.height / start.fy) / 2.0
-    sigma_k1 = _CORNER_DISTORTION / corner**2
-    at_k1 = INTRINSIC_NAMES.index("k1")
-    at_f = [INTRINSIC_NAMES.index("fx"), INTRINSIC_NAMES.index("fy")]
+    prior = 1.0 / np.array([_SIGMA_LOG_FOCAL, _RADIAL / corner**2, _DECENTRED / corner, _DECENTRED / corner])
     pose = camera_T_body
-    prior = np.array([1.0 / _SIGMA_LOG_FOCAL, 1.0 / sigma_k1]) * 1.0
 
     def cost(p: Array, c: Camera) -> float:
-        r = (xy - project(c, transform(p, points))) / scale
-        s = np.sum(r**2, axis=1)
+        s = np.sum(((xy - project(c, transform(p, points))) / scale) ** 2, axis=1)
         if not np.isfinite(s).all():
             return np.inf
-        return float(np.sum(np.log1p(s))) + float(np.sum((prior * _lens_off(start, c)) ** 2))
+        return float(np.sum(np.log1p(s)) + np.sum((prior * _lens_off(start, c)) ** 2))
 
     damping, value = 1e-4, cost(pose, camera)
+    lens = np.arange(6, 10)
     for _ in range(iterations):
-        value_xy, d_point, d_lens = project_with_jacobians(camera, transform(pose, points))
+        predicted, d_point, d_lens = project_with_jacobians(camera, transform(pose, points))
         R = pose[:3, :3]
         by_pose = d_point @ np.concatenate([np.broadcast_to(R, (len(points), 3, 3)), -R @ skew(points)], axis=-1)
-        by_focal = d_lens[:, :, at_f[0]] * camera.fx + d_lens[:, :, at_f[1]] * camera.fy
-        J = np.concatenate([by_pose, by_focal[..., None], d_lens[:, :, at_k1, None]], axis=-1) / scale
-        r = (xy - value_xy) / scale
+        by_focal = d_lens[:, :, _AT["fx"]] * camera.fx + d_lens[:, :, _AT["fy"]] * camera.fy
+        by_rest = d_lens[:, :, [_AT["k1"], _AT["p1"], _AT["p2"]]]
+        J = np.concatenate([by_pose, by_focal[..., None], by_rest], axis=-1) / scale
+        r = (xy - predicted) / scale
         weight = 1.0 / (1.0 + np.sum(r**2, axis=1))
-        N = np.einsum("m,mia,mib->ab", weight, J, J)
-        g = np.einsum("m,mia,mi->a", weight, J, r)
-        N[[6, 7], [6, 7]] += prior**2
-        g[6:] -= prior**2 * _lens_off(start, camera)
-        step = np.linalg.solve(N + damping * np.diag(np.diag(N)) + 1e-30 * np.eye(8), g)
-        trial_pose = retract(pose, step[:6])
+        weighted = J * weight[:, None, None]
+        N = np.tensordot(weighted, J, axes=((0, 1), (0, 1)))
+        g = np.tensordot(weighted, r, axes=((0, 1), (0, 1)))
+        N[lens, lens] += prior**2
+        g[lens] -= prior**2 * _lens_off(start, camera)
+        step = np.linalg.solve(N + damping * np.diag(np.diag(N)) + 1e-30 * np.eye(10), g)
         factor = float(np.exp(np.clip(step[6], -0.2, 0.2)))
-        trial = replace(camera, fx=camera.fx * factor, fy=camera.fy * factor, k1=camera.k1 + float(step[7]))
+        trial_pose = retract(pose, step[:6])
+        trial = replace(
+            camera, fx=camera.fx * factor, fy=camera.fy * factor, k1=camera.k1 + float(step[7]),
+            p1=camera.p1 + float(step[8]), p2=camera.p2 + float(step[9]),
+        )  # fmt: skip
         trial_value = cost(trial_pose, trial)
         if trial_value <= value:
             gain = value - trial_value
             pose, camera, value, damping = trial_pose, trial, trial_value, damping * 0.2
-            if gain < 1e-6 * (1e-3 + value):
+            if gain < 1e-5 * (1e-3 + value):
                 break
         else:
             damping = max(damping, 1e-4) * 10.0
@@ -122,7 +131,8 @@ def refine_with_lens(
 
 
 def _lens_off(start: Camera, camera: Camera) -> Array:
-    return np.array([np.log(camera.fx / start.fx), camera.k1 - start.k1])
+    others = (camera.k1 - start.k1, camera.p1 - start.p1, camera.p2 - start.p2)
+    return np.array([np.log(camera.fx / start.fx), *others])
 
 
 def _assign(predicted: Array, xy: Array, tree: cKDTree, gate: float) -> tuple[IntArray, IntArray]:
@@ -146,6 +156,12 @@ class View:
     direction: Array
     seen: NDArray[np.bool_]
     inside: NDArray[np.bool_]
+
+
+def without_stragglers(found: Grown) -> Grown:
+    """The dots within five usual errors (2.5 px at least): the others fit by chance as well as not."""
+    keep = found.off <= max(_LAST_GATE, 5.0 * usual_error(found.off))
+    return replace(found, dots=found.dots[keep], targets=found.targets[keep], off=found.off[keep])
 
 
 def view_of(found: Grown, points: Array) -> View:
