@@ -1,0 +1,96 @@
+"""Every cause that shows in images is found, named and sized; where nothing is missing nothing is said."""
+
+import numpy as np
+import pytest
+
+from robcal.diagnosis.image_data import survey_data
+from robcal.diagnosis.image_diagnosis import diagnose_images
+from robcal.diagnosis.image_exchange import exchanged_targets
+from tests.diagnosis.image_scenes import station, survey, told
+
+
+def _named(finding, effect):
+    return {(finding.cause, finding.where), *finding.rivals} >= {(effect.cause, effect.where)}
+
+
+@pytest.mark.parametrize("cause", ["target_shifted", "refraction", "body_thermal_growth"])
+def test_cause_of_a_station_is_found_and_named(cause):
+    scene = station(cause, snr=9.0, seed=3, targets=20)
+    found = told(scene)
+    assert [f.cause for f in found] == [cause]
+    assert _named(found[0], scene.effects[0])
+    assert found[0].p_value < 0.01
+    assert found[0].heldout_px[1] < found[0].heldout_px[0]
+
+
+def test_small_move_of_a_camera_is_told_with_its_rival():
+    scene = station("camera_moved", snr=8.0, seed=2, views=20)
+    assert not scene.orientation.evidence  # too small for the adjustment to act by itself
+    found = diagnose_images(scene.data).findings
+    assert [f.cause for f in found] == ["camera_moved"]
+    assert _named(found[0], scene.effects[0])
+
+
+def test_growth_has_the_right_size():
+    scene = station("body_thermal_growth", snr=20.0, seed=4)
+    (found,) = diagnose_images(scene.data).findings
+    true = scene.effects[0].value("um_per_m_K")
+    assert abs(found.parameters["um_per_m_K"] - true) < 4.0 * found.sigma["um_per_m_K"]
+    assert ("scale_drift", "station") in found.rivals
+
+
+@pytest.mark.parametrize("snr", [7.5, 30.0])
+def test_shift_of_a_target_has_the_right_size(snr):
+    scene = station("target_shifted", snr=snr, seed=5, targets=20)
+    (found,) = told(scene)
+    true = np.array(scene.effects[0].vector("shift_mm"))
+    assert np.all(np.abs(np.array(found.parameters["shift_mm"]) - true) < 4.0 * np.array(found.sigma["shift_mm"]))
+
+
+def test_exchanged_targets_are_told_as_such():
+    scene = station("target_swapped", seed=6)
+    (found,) = exchanged_targets(scene.orientation, scene.marks, scene.given)
+    effect = scene.effects[0]
+    pair = {int(found.where), found.parameters["with"]}
+    assert pair == {int(effect.where), int(effect.parameters["with"])}
+    assert not exchanged_targets(*[getattr(station(seed=6), name) for name in ("orientation", "marks", "given")])
+
+
+@pytest.mark.parametrize("stated_factor", [0.85, 1.0, 1.15])
+def test_nothing_missing_in_a_station(stated_factor):
+    quiet = [diagnose_images(station(seed=50 + s, stated_factor=stated_factor).data) for s in range(3)]
+    assert not any(d.findings for d in quiet)
+    assert min(d.p_value for d in quiet) > 1e-3
+
+
+def test_nothing_missing_in_a_survey():
+    for seed in range(3):
+        done, _ = survey(seed=70 + seed)
+        found = diagnose_images(survey_data(done.network, None, "survey", dots=False))
+        assert not found.findings
+
+
+def test_body_less_accurate_than_stated_is_no_crowd_of_shifted_targets():
+    """All coordinates wrong by ten times their stated sigma: no single target stands out."""
+    from robcal.diagnosis.image_station import station_data
+    from robcal.photogrammetry.bodies import Body
+
+    scene = station(seed=8)
+    rng = np.random.default_rng(1)
+    wrong = Body(
+        "plate", scene.given.ids, scene.given.points + 2e-5 * rng.standard_normal(scene.given.points.shape),
+        scene.given.covariance, scene.given.codes, scene.given.diameters,
+    )  # fmt: skip
+    data = station_data(scene.orientation, scene.names, wrong, dict.fromkeys(scene.orientation.names))
+    assert not [f for f in diagnose_images(data).findings if f.cause == "target_shifted"]
+
+
+def test_station_rows_are_an_orthogonal_projection():
+    """The adjusted residuals lie where nothing is left to absorb, and removing twice is removing once."""
+    data = station(seed=9).data
+    assert np.allclose(data.remove(data.residual), data.residual, atol=1e-8)
+    columns = np.random.default_rng(0).standard_normal((len(data.residual), 3))
+    once = data.remove(columns)
+    assert np.allclose(data.remove(once), once, atol=1e-8)
+    assert np.allclose(once.T @ columns, once.T @ once, atol=1e-7)
+    assert abs(data.residual @ data.residual / data.freedom - 1.0) < 0.2
