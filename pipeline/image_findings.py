@@ -52,8 +52,8 @@ def images_of(campaign: Campaign, run: Run) -> ImageFindings:
         orientation: StationOrientation = run.load("orient")
         names: Sequence[str] = campaign.poses.names if campaign.poses is not None else ()
         given = surveyed_or_given(campaign, run, orientation.body.name)
-        start = {camera: s.start.camera if s.start else None for camera, s in campaign.cameras.items()}
-        data = station_data(orientation, tuple(names), given, start, _covariates(campaign))
+        files = {camera: s.start.camera if s.start else None for camera, s in campaign.cameras.items()}
+        data = station_data(orientation, tuple(names), given, files, _covariates(campaign))
         marks: dict[str, StationMarks] = run.load("marks")
         swapped = exchanged_targets(orientation, marks, given)
         explained = frozenset(str(name) for f in swapped for name in (f.where, f.parameters["with"]))
