@@ -129,6 +129,7 @@ def _with_rivals(
         rival = grow(camera, start, points, xy[own], reach=tolerance, tree=tree, lens=best.camera)
         if rival is not None:
             pool.append(_renumbered(rival, own))
+    pool = [without_stragglers(f) for f in pool]
     sigma = min(usual_error(f.off) for f in pool if len(f.dots) >= 0.9 * max(len(g.dots) for g in pool))
     density = _density(xy[best.dots], xy[own])
     value = [log_odds(f, points, sigma=sigma, density=density, others=others) for f in pool]
@@ -141,4 +142,4 @@ def _with_rivals(
         differs = any(numbers.get(int(d), int(t)) != int(t) for d, t in zip(f.dots, f.targets, strict=True))
         if differs and value[k] > value[order[0]] - _SAME:
             out.append(f)
-    return [without_stragglers(f) for f in out]
+    return out

@@ -51,7 +51,8 @@ def grow(
     """Match and refine until the matches stay, the gate following the residuals from ``reach`` (px) downwards.
 
     The gate stays so wide that systematic errors no lens explains do not cut off whole parts of the body, as far as
-    the dots ``xy`` are sparse enough for it. ``lens`` is the camera that belongs to the pose, if adjusted already. Returns None where fewer than six dots, or dots in one line, are left.
+    the dots ``xy`` are sparse enough for it. ``lens`` is the camera that belongs to the pose, if adjusted already.
+    Returns None where fewer than six dots, or dots in one line, are left.
     """
     tree = cKDTree(xy) if tree is None else tree
     extent = float(np.prod(np.maximum(np.ptp(xy, axis=0), 1.0)))
@@ -183,7 +184,7 @@ def log_odds(
 
     Parameters
     ----------
-    sigma : px per coordinate of a matched dot; errors are taken with long tails (Student, three degrees of freedom).
+    sigma : px per coordinate of a matched dot; errors are taken with long tails (Student, five degrees of freedom).
     density : dots of like look per px^2 where the body is.
     others : what cameras of known numbering see; those within 60 degrees of this camera's direction count.
 
@@ -208,14 +209,14 @@ def log_odds(
             hits += _OTHER * (other.seen & other.inside)
             trials += _OTHER * other.inside
     shown = hits / trials
-    fit = -np.log(2.0 * np.pi * sigma**2 * density) - 2.5 * np.log1p((found.off / sigma) ** 2 / 3.0)
+    fit = -np.log(2.0 * np.pi * sigma**2 * density) - 3.5 * np.log1p((found.off / sigma) ** 2 / 5.0)
     missing = inside & ~seen
     return float(np.sum(np.log(shown[found.targets]) + fit)) + float(np.sum(np.log(1.0 - shown[missing])))
 
 
 def usual_error(off: Array) -> float:
-    """Scale per coordinate (px) of distances (k,) with long tails: their median is 1.3 scales (Student, three)."""
-    return max(0.2, float(np.median(off)) / 1.3) if len(off) else np.inf
+    """Scale per coordinate (px) of distances (k,) with long tails: their median is 1.26 scales (Student, five)."""
+    return max(0.2, float(np.median(off)) / 1.26) if len(off) else np.inf
 
 
 def _inside(found: Grown, points: Array) -> NDArray[np.bool_]:
