@@ -9,7 +9,7 @@ import numpy as np
 
 from pipeline.report.blocks import Block, Chapter, Figure, Table, Text, table
 from pipeline.report.evidence_plots import evidence_figure
-from pipeline.report.image_cause_plots import lens_figure, steps_figure
+from pipeline.report.image_cause_plots import gains_figure, lens_figure
 from pipeline.report.material import Material
 from pipeline.report.robot_plot import robot_figure
 from pipeline.report.style import AFTER, BEFORE, GREY, label, layout, number, percent, probability, rounded
@@ -166,7 +166,7 @@ def _plots(material: Material, causes: list[dict[str, Any]]) -> list[Block]:
 
 
 def _image_plots(material: Material, causes: list[dict[str, Any]]) -> list[Block]:
-    """The lens' curve where radial distortion was found; the error step by step where there are several causes."""
+    """The lens' curve where radial distortion was found; what each gains where there are several."""
     blocks: list[Block] = []
     lenses = {str(c.get("where")) for c in causes if c.get("cause") == "lens_radial"}
     for name, (camera, covariance) in _cameras(material).items():
@@ -177,7 +177,7 @@ def _image_plots(material: Material, causes: list[dict[str, Any]]) -> list[Block
         mine = [c for c in causes if c.get(key)]
         if len(mine) > 1 or (mine and key == "heldout_px"):
             names = [f"{said(c.get('cause'))}, {c.get('where')}" for c in mine]
-            figure = steps_figure(mine, names, key, (d.get(key) or {}).get("noise_floor"))
+            figure = gains_figure(mine, names, key, (d.get(key) or {}).get("noise_floor"))
             blocks += [figure] if figure is not None else []
     return blocks
 

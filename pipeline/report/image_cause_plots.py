@@ -1,4 +1,4 @@
-"""Plots for causes found in images: the lens' curve with its uncertainty, and the error step by step."""
+"""Plots for causes found in images: the lens' curve with its uncertainty, and what each cause gains."""
 
 from __future__ import annotations
 
@@ -36,30 +36,33 @@ def lens_figure(name: str, camera: Camera, covariance: Array) -> Figure:
     ]  # fmt: skip
     told = f"Radial distortion of {label(name)}: the camera file has none, the images show this."
     return Figure(tuple(data), layout("distance from the principal point (px)", "radial shift (px)"), told,
-                  f"Radial distortion of {name}", height=320, wide=False)  # fmt: skip
+                  f"Radial distortion of {name}", height=320)  # fmt: skip
 
 
-def steps_figure(
+def gains_figure(
     causes: Sequence[dict[str, Any]], names: Sequence[str], key: str, floor: float | None
 ) -> Figure | None:
-    """Error on kept-out data before anything, and with each cause added to those before it."""
+    """Error on kept-out data without and with each cause, those before it in the list included."""
     unit = key.removeprefix("heldout_")
     held = [(n, c[key]) for c, n in zip(causes, names, strict=True) if c.get(key)]
     if not held or any(h.get("before") is None or h.get("after") is None for _, h in held):
         return None
-    x = ["before", *(f"{k}. {label(n)}" for k, (n, _) in enumerate(held, 1))]
-    y = [held[0][1]["before"], *(h["after"] for _, h in held)]
-    data = {"type": "bar", "x": x, "y": rounded(y), "marker": {"color": [BEFORE] + [AFTER] * len(held)},
-            "text": [number(v) for v in y], "textposition": "outside", "cliponaxis": False}  # fmt: skip
+    y = [f"{k}. {label(n)}" for k, (n, _) in enumerate(held, 1)]
+    data = tuple(
+        {"type": "bar", "orientation": "h", "y": y, "x": rounded([h[kind] for _, h in held]), "name": name,
+         "marker": {"color": colour}, "text": [number(h[kind]) for _, h in held], "textposition": "outside",
+         "cliponaxis": False}
+        for kind, name, colour in (("after", "with it", AFTER), ("before", "without it", BEFORE))
+    )  # fmt: skip
     shapes = []
     if floor:
-        shapes = [{"type": "line", "xref": "paper", "x0": 0, "x1": 1, "y0": floor, "y1": floor,
+        shapes = [{"type": "line", "yref": "paper", "y0": 0, "y1": 1, "x0": floor, "x1": floor,
                    "line": {"color": GREY, "dash": "dash"}}]  # fmt: skip
     return Figure(
-        (data,),
-        layout("", f"error ({unit}, RMS)", shapes=shapes, showlegend=False, xaxis={"type": "category"}),
-        "Error on kept-out data, step by step as the causes were added. Dashed: noise of the measurement.",
-        "Error on kept-out data with each cause added",
-        height=320,
-        wide=False,
-    )
+        data,
+        layout(f"error ({unit}, RMS)", "", shapes=shapes, barmode="group", legend={"traceorder": "reversed"},
+               margin={"r": 60}, yaxis={"type": "category", "autorange": "reversed"}),
+        "Error on kept-out data without and with each cause. Dashed: noise of the measurement.",
+        "Error on kept-out data without and with each cause",
+        height=130 + 62 * len(held),
+    )  # fmt: skip

@@ -81,7 +81,7 @@ def percent(share: float) -> str:
 def probability(p: object) -> str:
     """A probability as text; what is too small to matter is told as a bound."""
     if isinstance(p, int | float) and np.isfinite(p) and p < 1e-12:
-        return "< 1e-12"
+        return "below 1e-12"
     return number(p, 2)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from pipeline.report.blocks import Block, Chapter, Figure, Table, Text, table
 from pipeline.report.material import Material
-from pipeline.report.style import AFTER, BEFORE, GREY, label, layout, number, percent, rounded
+from pipeline.report.style import AFTER, BEFORE, GREY, label, layout, number, percent, probability, rounded
 from robcal.calibration.observations import FrameObservations
 from robcal.calibration.verification import TEST_VECTORS, Verification
 from robcal.transforms import Array, skew
@@ -202,7 +202,7 @@ def _honesty(v: Verification) -> str:
     inside = f"{percent(v.coverage_95)} of the poses lie inside their 95 % region"
     if v.p_value < 0.01:
         return (
-            f"{inside}; the errors are larger than predicted (p = {number(v.p_value, 2)}): some error is left that "
+            f"{inside}; the errors are larger than predicted (p = {probability(v.p_value)}): some error is left that "
             "neither model nor noise explains, so take the stated sigmas as too small."
         )
-    return f"{inside}; errors and predictions agree (p = {number(v.p_value, 2)})."
+    return f"{inside}; errors and predictions agree (p = {probability(v.p_value)})."
