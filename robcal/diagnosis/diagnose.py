@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from robcal.diagnosis.analysis import Analysis, analyse
 from robcal.diagnosis.heldout import cross_validated, folds, noise_floor, position_errors, rms
 from robcal.diagnosis.naming import rivals, signature
 from robcal.diagnosis.next_poses import separating_poses
-from robcal.diagnosis.noise import Noise, estimate_noise
+from robcal.diagnosis.noise import estimate_noise
 from robcal.diagnosis.recording import Accepted, Fit, Recording, fit, observation_data, pseudo_covariance
 from robcal.diagnosis.result import Diagnosis, Finding, Rival
 from robcal.diagnosis.selection import Selection, SelectionSettings, poses_that_carry, select
@@ -21,6 +22,8 @@ from robcal.physics.measuring import describe, swapped
 from robcal.robot.model import RobotModel
 
 DEFAULTS = SelectionSettings()
+MOST_POSES = 400
+"""Poses on which a search is done; the final fit takes all."""
 
 
 def diagnose(
@@ -46,16 +49,24 @@ def diagnose(
     exchanged = _swap_findings(model, recording, verify, free, swaps)
     recording = relabelled(recording, swaps)
     verify = None if verify is None else relabelled(verify, swaps)
-    noise = estimate_noise(model, recording, free)
-    weighted = noise.apply(recording)
-    chosen = select(model, weighted, free, tied, settings, tell)
+    thin = thinned(recording)
+    noise = estimate_noise(model, thin, free)
+    chosen = select(model, noise.apply(thin), free, tied, settings, tell)
     if chosen.accepted:
-        # the first estimate contained the effects: weigh anew and look again, from the model with everything in it
+        # the first estimate contained the effects
         noise = estimate_noise(model, chosen.recording, free, chosen.accepted)
     before = fit(model, chosen.recording, free)
     final = chosen.last.fit
+    whole = chosen.recording
+    if thin is not recording:
+        whole = replace(recording, shared=None)
+        final = fit(model, whole, chosen.free, chosen.accepted)
     findings = (*exchanged, *_findings(model, chosen, chosen.free, chosen.tied, verify, before))
-    heldout = _heldout(chosen.recording, before, final, verify, noise)
+    heldout = (
+        _error(chosen.recording, before, verify),
+        _error(whole, final, verify),
+        noise_floor(verify if verify is not None else recording, noise.factor),
+    )
     if exchanged:
         heldout = (exchanged[0].heldout[0], *heldout[1:])
     poses: tuple[dict[str, float], ...] = ()
@@ -84,6 +95,16 @@ def diagnose(
         next_poses=poses,
         seconds=time.perf_counter() - start,
     )
+
+
+def thinned(recording: Recording) -> Recording:
+    """The recording itself, or of a very long one poses spread evenly over it: enough to find and name what matters."""
+    count = len(recording.q)
+    if count <= MOST_POSES:
+        return recording
+    keep = np.zeros(count, dtype=bool)
+    keep[np.unique(np.linspace(0, count - 1, MOST_POSES).round().astype(int))] = True
+    return recording.subset(keep)
 
 
 def _swap_findings(
@@ -126,13 +147,6 @@ def recording_data(present: Fit, recording: Recording) -> ObservationData:
     """Observation data of a recording at a fit."""
     variables = present.kernel.variables(present.theta, present.inputs)
     return observation_data(recording, present.frames, variables)
-
-
-def _heldout(
-    recording: Recording, before: Fit, final: Fit, verify: Recording | None, noise: Noise
-) -> tuple[float, float, float]:
-    floor = noise_floor(verify if verify is not None else recording, noise.factor)
-    return (_error(recording, before, verify), _error(recording, final, verify), floor)
 
 
 def _error(recording: Recording, fitted: Fit, verify: Recording | None) -> float:
