@@ -9,6 +9,7 @@ enough to identify them by geometry; their covariance says so.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -59,7 +60,7 @@ def with_coarse_dots(image: NDArray, found: Detections, *, polarity: str = "brig
     columns["kind"] = np.full(n, int(TargetKind.DOT), np.int8)
     columns["blur"] = np.full(n, np.nan)
     columns["residual"] = np.full(n, np.nan)
-    joined = {name: np.concatenate([old, columns[name]]) for name, old in found.columns().items()}
+    joined: dict[str, Any] = {name: np.concatenate([old, columns[name]]) for name, old in found.columns().items()}
     return replace(found, message="", **joined)
 
 

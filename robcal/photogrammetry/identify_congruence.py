@@ -38,9 +38,10 @@ def congruences(points: Array, seen: IntArray, *, share: float = 0.75, tolerance
         own = np.broadcast_to(points[base], (len(images), 3, 3))
         motions = _triangle_frame(points[images]) @ np.linalg.inv(_triangle_frame(own))
         motions = motions[np.isfinite(motions).all(axis=(1, 2))]
-        d, index = tree.query(transform(motions[:, None], points[seen][None]))
-        hit = d < tolerance
-        for motion, onto, there in zip(motions, index, hit, strict=True):
+        moved = transform(motions[:, None], points[seen][None])
+        nearest = tree.query(moved)
+        hit = np.asarray(nearest[0]) < tolerance
+        for motion, onto, there in zip(motions, np.asarray(nearest[1]), hit, strict=True):
             if there.mean() < share or np.array_equal(onto[there], identity[there]):
                 continue
             found.setdefault(np.where(there, onto, -1).tobytes(), motion)
@@ -57,7 +58,7 @@ def _base_triangles(points: Array, seen: IntArray) -> list[IntArray]:
         # compact triangles stay on the body under more motions than wide ones: area by the cube root of extent
         u, v = p[a[1]] - p[a[0]], p[a[2]] - p[a[0]]
         area = float(np.linalg.norm(np.cross(u, v)))
-        extent = max(np.linalg.norm(u), np.linalg.norm(v), np.linalg.norm(u - v))
+        extent = float(np.linalg.norm([u, v, u - v], axis=1).max())
         best.append((area / max(extent, 1e-300) ** 2 * (1.0 - 0.3 * rng.random()), seen[a]))
     best.sort(key=lambda item: -item[0])
     return [triangle for _, triangle in best[:3]]

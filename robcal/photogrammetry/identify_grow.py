@@ -198,8 +198,7 @@ def log_odds(
     seen = np.zeros(len(points), dtype=bool)
     seen[found.targets] = True
     k = min(_NEIGHBOURS + 1, len(points))
-    _, near = cKDTree(points).query(points, k=k)
-    near = near[:, 1:]
+    near = np.asarray(cKDTree(points).query(points, k=k)[1])[:, 1:]
     there = inside[near]
     hits = np.sum(seen[near] & there, axis=1) + 1.0
     trials = there.sum(axis=1) + 2.0

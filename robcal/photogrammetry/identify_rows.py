@@ -32,7 +32,7 @@ _AROUND = 60.0
 def body_rows(points: Array) -> list[IntArray]:
     """Rows (five or more, in order) of equally spaced points (n, 3) in a line, the longest first, each once."""
     tree = cKDTree(points)
-    reach = 3.0 * float(np.median(tree.query(points, k=2)[0][:, 1]))
+    reach = 3.0 * float(np.median(np.asarray(tree.query(points, k=2)[0])[:, 1]))
     found: dict[tuple[int, ...], IntArray] = {}
     for a, b in tree.query_pairs(reach):
         v = points[b] - points[a]
@@ -48,9 +48,9 @@ def body_rows(points: Array) -> list[IntArray]:
             found.setdefault(tuple(sorted(row)), np.array(row, dtype=np.int64))
     rows = sorted(found.values(), key=lambda r: -len(r))
     kept: list[IntArray] = []
-    for row in rows:  # every second dot of a row is no row of its own
-        if not any(np.isin(row, other).all() for other in kept):
-            kept.append(row)
+    for candidate in rows:  # every second dot of a row is no row of its own
+        if not any(np.isin(candidate, other).all() for other in kept):
+            kept.append(candidate)
     return kept[:_MAX_ROWS]
 
 
@@ -80,7 +80,7 @@ def image_rows(xy: Array, size: Array, contrast: Array, *, longest_step: float) 
     alive = np.concatenate([pairs, pairs[:, ::-1]])
     for _ in range(3):
         v = xy[alive[:, -1]] - xy[alive[:, -2]]
-        distance, nxt = tree.query(xy[alive[:, -1]] + v)
+        distance, nxt = (np.asarray(a) for a in tree.query(xy[alive[:, -1]] + v))
         ok = (distance < _gate(np.linalg.norm(v, axis=1))) & (nxt != alive[:, -1])
         ok &= (np.abs(features[nxt] - features[alive[:, -1]]) < 1.3 * _LIKE).all(axis=1)
         alive = np.column_stack([alive[ok], nxt[ok]])
@@ -94,7 +94,7 @@ def image_rows(xy: Array, size: Array, contrast: Array, *, longest_step: float) 
         done.update(pairwise(chain))
         done.update(pairwise(chain[::-1]))
         dots = np.array([i for i in chain if i >= 0])
-        pitch = np.linalg.norm(xy[dots[-1]] - xy[dots[0]]) / (len(chain) - 1)
+        pitch = float(np.linalg.norm(xy[dots[-1]] - xy[dots[0]])) / (len(chain) - 1)
         by_chance = np.minimum(density[dots] * np.pi * _gate(pitch) ** 2, 0.9)
         # two dots make the pair; a gap is a second chance
         surprise = float(-np.sort(np.log(by_chance))[::-1][2:].sum()) - 0.7 * (len(chain) - len(dots))
@@ -102,13 +102,13 @@ def image_rows(xy: Array, size: Array, contrast: Array, *, longest_step: float) 
             found.append((surprise, np.array(chain, dtype=np.int64)))
     found.sort(key=lambda item: -item[0])
     kept: list[IntArray] = []
-    for _, chain in found:
-        if not any(np.isin(chain, other).mean() > 0.5 for other in kept):
-            kept.append(chain)
+    for _, dots in found:
+        if not any(np.isin(dots, other).mean() > 0.5 for other in kept):
+            kept.append(dots)
     return kept[:_MAX_CHAINS]
 
 
-def _gate(pitch: Array) -> Array:
+def _gate(pitch: Array | float) -> Array:
     """Error (px) of the next dot extrapolated from the last ones: perspective and the dots' own noise."""
     return np.asarray(0.02 * pitch + 1.2)
 
