@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -12,8 +12,8 @@ from pipeline.poses_table import Poses
 from pipeline.runs import Run
 from robcal.errors import InvalidInput
 from robcal.robot.kernel import Kernel, PoseInputs
-from robcal.robot.model import RobotModel
-from robcal.transforms import Array
+from robcal.robot.model import GEOMETRIC_KINDS, RobotModel
+from robcal.transforms import Array, frame_from_xyzrpy
 
 Statics = Literal["one_step", "converged"]
 
@@ -55,6 +55,21 @@ def load_calibrated(run: Run) -> Calibrated:
             found: Calibrated = run.load(name)
             return found
     raise InvalidInput(f"{run.folder}: holds no calibrated robot: the campaign needs a robot, poses and measurements")
+
+
+def with_folded_cell(model: RobotModel) -> RobotModel:
+    """The model with its deviations of base and tool folded into the references: readers of the robot file need not
+    know them. Weakness: terms that act on base or tool follow the deviations instead of adding to them, a difference
+    of second order.
+    """
+    references = {"base": model.world_T_base, "tool": model.flange_T_tool}
+    folded = {}
+    for end, reference in references.items():
+        six = [model.parameters.get(f"{end}.{kind}", 0.0) for kind in GEOMETRIC_KINDS]
+        folded[end] = (np.eye(4) if reference is None else reference) @ frame_from_xyzrpy(six)
+    ends = {f"{end}.{kind}" for end in references for kind in GEOMETRIC_KINDS}
+    parameters = {name: value for name, value in model.parameters.items() if name not in ends}
+    return replace(model, parameters=parameters, world_T_base=folded["base"], flange_T_tool=folded["tool"])
 
 
 def recorded_inputs(kernel: Kernel, poses: Poses) -> PoseInputs:

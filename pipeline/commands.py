@@ -44,7 +44,7 @@ def diagnose_place(
     if is_run(place):
         run = open_run(place)
         campaign, out = campaign_of(run), run.folder
-        if not (campaign / "campaign.yaml").is_file():
+        if not campaign.is_file():
             raise InvalidInput(f"{place}: its campaign {campaign} is gone: the diagnosis needs the recordings")
     else:
         campaign = place

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.bodies import body_for_robot
-from pipeline.calibrated import Calibrated
+from pipeline.calibrated import Calibrated, with_folded_cell
 from pipeline.campaign import Campaign
 from pipeline.common_errors import common_errors
 from pipeline.image_findings import images_of
@@ -100,7 +100,7 @@ def work(context: Context) -> Outcome:
     if diagnosis.findings:
         calibrated = dataclasses.replace(
             calibrated,
-            model=diagnosis.model,
+            model=with_folded_cell(diagnosis.model),
             names=diagnosis.free,
             covariance=_covariance(diagnosis, recording),
             statics="converged",  # as the diagnosis fits
@@ -110,8 +110,8 @@ def work(context: Context) -> Outcome:
     outputs.append(run.save("evidence", evidence_of(found.model, recording, found.names, verify, diagnosis)))
     told = [f.statement for f in images.findings] + [f.statement for f in diagnosis.findings]
     notes = told or ["nothing missing: the model explains the data"]
-    result = _result(diagnosis) | {"mismatch": content["mismatch"]}
-    result["causes"] = _named(images.findings) + list(result["causes"])
+    result: dict[str, Any] = _result(diagnosis) | {"mismatch": content["mismatch"]}
+    result["causes"] = [*_named(images.findings), *result["causes"]]
     return Outcome({"diagnosis": result}, outputs, notes)
 
 

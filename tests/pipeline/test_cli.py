@@ -137,3 +137,13 @@ def test_as_a_process_nothing_but_the_sentence_is_printed(point_campaign: Path, 
     assert "Traceback" not in done.stderr
     assert done.stdout == ""
     assert len(done.stderr.strip().splitlines()) == 1
+
+
+def test_diagnose_takes_a_run(point_campaign: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    begun = runner.invoke(app, ["run", str(point_campaign), "--out", str(run), "-q", "--until", "identify"])
+    assert begun.exit_code == 0
+    edit_yaml(point_campaign / "campaign.yaml", lambda d: d.pop("diagnosis"))
+    result = runner.invoke(app, ["diagnose", str(run), "--json", "-q"])
+    assert result.exit_code == 0, result.output
+    assert json.loads(result.stdout)["diagnosis"]["format"] == "robcal/diagnosis-1"
