@@ -6,7 +6,7 @@ y down. Source of the model: OpenCV documentation, "Camera Calibration and 3D Re
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -44,7 +44,7 @@ class Camera:
         values = np.asarray(numbers, dtype=float)
         if values.shape != (9,):
             raise InvalidInput(f"interior orientation needs nine numbers, got shape {values.shape}")
-        return replace(self, **dict(zip(INTRINSIC_NAMES, map(float, values), strict=True)))
+        return Camera(self.width, self.height, *map(float, values))
 
     @property
     def matrix(self) -> Array:

@@ -35,7 +35,8 @@ def site(fitted: frozenset[str] = frozenset({"axis1.elastic_yaw", "axis2.elastic
     moments = [f"axis{k}_m{a}" for k in (1, 2) for a in ("roll", "pitch", "yaw")]
     variables |= {name: 800 * rng.normal(size=n) for name in moments}
     variables |= {f"approach{k}": rng.choice([-1.0, 1.0], n) for k in (1, 2)}
-    variables |= {"index": np.arange(n, dtype=float), "time_s": 60.0 * np.arange(n), "temp_arm_c": 20 + 0.1 * np.arange(n)}
+    variables |= {"index": np.arange(n, dtype=float), "time_s": 60.0 * np.arange(n)}
+    variables["temp_arm_c"] = 20 + 0.1 * np.arange(n)
     return RobotSite(model, variables, fitted, frozenset())
 
 
