@@ -8,7 +8,6 @@ enough to identify them by geometry; their covariance says so.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -61,7 +60,7 @@ def with_coarse_dots(image: NDArray, found: Detections, *, polarity: str = "brig
     columns["blur"] = np.full(n, np.nan)
     columns["residual"] = np.full(n, np.nan)
     joined: dict[str, Any] = {name: np.concatenate([old, columns[name]]) for name, old in found.columns().items()}
-    return replace(found, message="", **joined)
+    return Detections(shape=found.shape, noise=found.noise, rejected=found.rejected, message="", **joined)
 
 
 def coarse_dots(image: NDArray, noise_sigma: float) -> tuple[Array, Array, Array, Array]:

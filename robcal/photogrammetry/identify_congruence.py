@@ -27,7 +27,7 @@ def congruences(points: Array, seen: IntArray, *, share: float = 0.75, tolerance
     """
     tree = cKDTree(points)
     if tolerance is None:
-        tolerance = 0.1 * float(np.median(tree.query(points, k=2)[0][:, 1]))
+        tolerance = 0.1 * float(np.median(np.asarray(tree.query(points, k=2)[0])[:, 1]))
     distance = np.linalg.norm(points[:, None] - points[None], axis=-1)
     found: dict[bytes, Array] = {}
     identity = seen.astype(np.int64)

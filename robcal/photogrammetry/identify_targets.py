@@ -20,6 +20,8 @@ from robcal.photogrammetry.resection import refine_poses, resect
 from robcal.transforms import Array, skew, transform
 
 _GATE = 5.0
+_CROWD = 100
+"""Dots in an image above which triples of dots are tried but briefly: they would not be enough in any time."""
 
 
 @dataclass(frozen=True)
@@ -113,7 +115,7 @@ def identify_targets(
                 return _joined(rows, ids, grid)
         found, why = search_body(
             camera, detections.xy[dots], detections.covariance[dots], detections.semi_axes[dots, 0], body, candidates,
-            model_error_px=model_error_px,
+            model_error_px=model_error_px, max_hypotheses=120_000 if len(dots) <= _CROWD else 30_000,
         )  # fmt: skip
         if len(found) == 1:
             single = IdentifiedImage(
