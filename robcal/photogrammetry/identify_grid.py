@@ -139,7 +139,8 @@ def _with_rivals(
     out = [first]
     for k in order[1:]:
         f = pool[k]
-        differs = any(numbers.get(int(d), int(t)) != int(t) for d, t in zip(f.dots, f.targets, strict=True))
-        if differs and value[k] > value[order[0]] - _SAME:
+        other = [numbers[int(d)] != int(t) for d, t in zip(f.dots, f.targets, strict=True) if int(d) in numbers]
+        # a stray dot more or less is the same numbering; a half turn may leave one row of several as it is
+        if (not other or np.mean(other) > 0.2) and value[k] > value[order[0]] - _SAME:
             out.append(f)
     return out
