@@ -16,6 +16,7 @@ from pipeline.image_findings import images_of
 from pipeline.poses_table import Poses
 from pipeline.runs import write_json
 from pipeline.stages.base import Context, Outcome, Stage, no_files
+from pipeline.stages.corrections import corrected
 from pipeline.stages.evidence import evidence_of
 from pipeline.stages.identify import load_identification, require_robot
 from pipeline.stages.observations import RobotRecording, Rows
@@ -107,12 +108,15 @@ def work(context: Context) -> Outcome:
             diagnosed=True,
         )
     outputs.append(run.save(f"calibrated_{NAME}", calibrated))
+    without = corrected(measured, poses, diagnosis)
+    if without is not None:
+        outputs.append(run.save("corrected", without))
     outputs.append(run.save("evidence", evidence_of(found.model, recording, found.names, verify, diagnosis)))
     told = [f.statement for f in images.findings] + [f.statement for f in diagnosis.findings]
     notes = told or ["nothing missing: the model explains the data"]
-    result: dict[str, Any] = _result(diagnosis) | {"mismatch": content["mismatch"]}
-    result["causes"] = [*_named(images.findings), *result["causes"]]
-    return Outcome({"diagnosis": result}, outputs, notes)
+    outcome = _result(diagnosis) | {"mismatch": content["mismatch"]}
+    outcome["causes"] = [*_named(images.findings), *_result(diagnosis)["causes"]]
+    return Outcome({"diagnosis": outcome}, outputs, notes)
 
 
 def own_elasticities(found: IdentifiedRobot) -> tuple[str, ...]:
@@ -174,6 +178,6 @@ STAGE = Stage(
     inputs=no_files,
     settings=lambda campaign: campaign.entry.diagnosis.model_dump(),
     after=("survey", "orient", "identify"),
-    code=("robcal/diagnosis", "robcal/physics", "pipeline/stages/diagnose.py", "pipeline/stages/evidence.py",
+    code=("robcal/diagnosis", "robcal/physics", "pipeline/stages/diagnose.py", "pipeline/stages/corrections.py", "pipeline/stages/evidence.py",
           "pipeline/image_findings.py"),
 )
