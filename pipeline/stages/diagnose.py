@@ -178,6 +178,6 @@ STAGE = Stage(
     inputs=no_files,
     settings=lambda campaign: campaign.entry.diagnosis.model_dump(),
     after=("survey", "orient", "identify"),
-    code=("robcal/diagnosis", "robcal/physics", "pipeline/stages/diagnose.py", "pipeline/stages/corrections.py", "pipeline/stages/evidence.py",
-          "pipeline/image_findings.py"),
+    code=("robcal/diagnosis", "robcal/physics", "pipeline/stages/diagnose.py", "pipeline/stages/corrections.py",
+          "pipeline/stages/evidence.py", "pipeline/image_findings.py"),
 )

@@ -110,7 +110,8 @@ def identify_recording(
     for _ in range(0 if recording.stated else 2):
         factors = variance_factors(found, subset, recording.select(rows), recording.observations)
         observations = rescaled(recording.observations, factors)
-        same = recording.detailed == recording.observations
+        pairs = zip(recording.detailed, recording.observations, strict=False)
+        same = len(recording.detailed) == len(recording.observations) and all(a is b for a, b in pairs)
         detailed = observations if same else rescaled(recording.detailed, [f[:1] for f in factors])
         recording = replace(recording, observations=observations, detailed=detailed)
         found = identify(robot, subset, recording.select(rows), options, kernel)

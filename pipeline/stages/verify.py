@@ -15,7 +15,7 @@ from pipeline.robot_file import write_robot
 from pipeline.runs import Run
 from pipeline.stages.base import Context, Outcome, Stage, no_files
 from pipeline.stages.identify import load_identification, options_of, require_robot
-from pipeline.stages.observations import RobotObservations, Rows
+from pipeline.stages.observations import RobotObservations, RobotRecording, Rows
 from pipeline.tables import write_table
 from robcal.calibration.identification import IdentifiedRobot
 from robcal.calibration.observations import (
@@ -44,12 +44,15 @@ def work(context: Context) -> Outcome:
     campaign, run = context.campaign, context.run
     robot, poses = require_robot(campaign)
     identification = load_identification(run)
-    recording, rows = identification.recording, identification.rows
+    rows = identification.rows
+    # what the diagnosis found in the measuring system is no error of the robot
+    taken_back = run.record("diagnose") is not None and run.has("corrected")
+    recording: RobotRecording = run.load("corrected") if taken_back else identification.recording
     calibrated = load_calibrated(run)
     final = with_model(identification.robot(), calibrated)
     inputs = recorded_inputs(final.kernel, poses)
     kept_out = np.array([i for i in recording.poses if poses.verify[i]], dtype=np.int64)
-    notes: list[str] = []
+    notes = ["measured positions are verified without what the diagnosis found in the measuring system"] * taken_back
     if len(kept_out):
         nominal = fit_nominal(robot, inputs.subset(rows), recording.select(rows))
         outcome = verify(final, inputs.subset(kept_out), recording.select(kept_out), nominal)
