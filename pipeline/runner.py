@@ -18,7 +18,6 @@ from pipeline.runs import (
     RUN_FORMAT,
     Run,
     StageRecord,
-    campaign_of,
     code_version,
     fingerprint,
     read_json,
@@ -115,8 +114,12 @@ def _keep_inputs_apart(campaign: Campaign, run: Run) -> None:
 def _adopt(run: Run, campaign: Campaign) -> None:
     path = run_file(run)
     here = str(campaign.path.resolve())
-    if path.is_file() and campaign_of(run) != Path(here):
-        before = read_json(path).get("name")
+    try:
+        known = read_json(path) if path.is_file() else {}
+    except InvalidInput:
+        known = {}  # damaged: written anew, and every stage's record is checked by itself
+    if known and known.get("campaign") != here:
+        before = known.get("name")
         if before != campaign.name:
             raise InvalidInput(
                 f"{run.folder}: holds the run of another campaign ('{before}'): choose another folder with --out"

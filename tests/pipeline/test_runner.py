@@ -181,3 +181,11 @@ def _kill_at_third_write(campaign: Path, out: Path) -> None:
 
     codec.save = counted
     run_campaign(campaign, out, until="detect", workers=1)
+
+
+def test_damaged_state_is_written_anew(point_campaign: Path, tmp_path: Path) -> None:
+    run_campaign(point_campaign, tmp_path / "run", until="frames")
+    (tmp_path / "run" / "state" / "run.json").write_bytes(b"garbage")
+    (tmp_path / "run" / "state" / "frames.json").write_bytes(b"garbage")
+    done = run_campaign(point_campaign, tmp_path / "run", until="frames")
+    assert done.ran == ("frames",)
