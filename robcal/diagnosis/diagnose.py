@@ -22,7 +22,7 @@ from robcal.physics.measuring import describe, swapped
 from robcal.robot.model import RobotModel
 
 DEFAULTS = SelectionSettings()
-MOST_POSES = 400
+MOST_POSES = 200
 """Poses on which a search is done; the final fit takes all."""
 
 

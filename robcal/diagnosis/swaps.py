@@ -79,4 +79,6 @@ def _median_distances(obs: PointObservations, ids: Array) -> Array:
 def _misfit(measured: Array, body: Array) -> float:
     expected = np.linalg.norm(body[:, None] - body[None], axis=2)
     off = ~np.eye(len(body), dtype=bool) & np.isfinite(measured)
+    if not off.any():  # no two targets in one pose: there is no distance to judge by
+        return 0.0
     return float(np.mean((measured - expected)[off] ** 2))

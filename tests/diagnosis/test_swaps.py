@@ -34,3 +34,9 @@ def test_exchange_is_found_and_undone() -> None:
     pairs = find_swaps(swapped)
     assert [set(pair) for pair in pairs] == [{11, 23}]
     assert find_swaps(relabelled(swapped, pairs)) == ()
+
+
+def test_single_targets_tell_nothing_of_numbers() -> None:
+    full = recording([0, 3, 2, 1, 4])
+    one_each = full.without_observations(np.setdiff1d(np.arange(60), 5 * np.arange(12) + np.arange(12) % 5))
+    assert find_swaps(one_each) == ()
