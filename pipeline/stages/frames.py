@@ -14,13 +14,15 @@ from pipeline.runs import Run
 from pipeline.stages.base import Context, Outcome, Stage
 from pipeline.tables import write_table
 from robcal.errors import InvalidInput
-from robcal.photogrammetry.bodies import Body
+from robcal.photogrammetry.bodies import Body, line_ratio
 from robcal.photogrammetry.measure_frames import MeasuredFrames, measure_frames
 from robcal.photogrammetry.measured_points import MeasuredPoints
 from robcal.photogrammetry.point_faults import length_ratio, mirrored, unit_fault
 from robcal.transforms import Array, xyzrpy_from_frame
 
 NAME = "frames"
+STRAIGHT = 0.02
+"""Second by first extent of a body below which its targets lie in one line."""
 
 
 def applies(campaign: Campaign) -> bool:
@@ -56,7 +58,7 @@ def _check_points(campaign: Campaign, points: MeasuredPoints, body: Body | None)
     ------
     InvalidInput : one of both, with the proof.
     """
-    if body is None:
+    if body is None or line_ratio(body.points[body.known]) < STRAIGHT:  # the fit itself says what is wrong with a line
         return
     tables = [t.path for t in campaign.measured("points")]
     where = tables[0] if tables else campaign.path
