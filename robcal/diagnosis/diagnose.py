@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,13 +15,22 @@ from robcal.diagnosis.next_poses import separating_poses
 from robcal.diagnosis.noise import estimate_noise
 from robcal.diagnosis.recording import Accepted, Fit, Recording, fit, observation_data, pseudo_covariance
 from robcal.diagnosis.result import Diagnosis, Finding, Rival
-from robcal.diagnosis.selection import Selection, SelectionSettings, poses_that_carry, select
+from robcal.diagnosis.selection import (
+    PLAUSIBLE_DEVIATION,
+    Selection,
+    SelectionSettings,
+    poses_that_carry,
+    select,
+)
 from robcal.diagnosis.swaps import find_swaps, relabelled
 from robcal.physics.family import Array, ObservationData, numeric_sigma
 from robcal.physics.measuring import describe, swapped
 from robcal.robot.model import RobotModel
+from robcal.robot.terms import identifier
 
 DEFAULTS = SelectionSettings()
+PLAUSIBLE_DEFLECTION = 3e-4
+"""rad under the largest load, for elasticities."""
 MOST_POSES = 200
 """Poses on which a search is done; the final fit takes all."""
 
@@ -178,22 +187,40 @@ def _findings(
     return tuple(findings)
 
 
-def _covariance(look: Analysis, item: Accepted) -> Array:
-    """Covariance of the amplitudes; the uncertainty of constants that were refined along with them included."""
+def _covariance(look: Analysis, item: Accepted, held: Iterable[str]) -> Array:
+    """Covariance of the amplitudes in units of the variance factor.
+
+    The uncertainty of constants that were refined along with them is included, and what the parameters add that the
+    identification holds at nominal values because the data hardly tell them: they are as random as robots are.
+    """
     family = item.family
-    bent = [name for name in family.continuous if np.isfinite(item.constants.get(name, np.inf))]
-    if not bent:
-        return item.covariance
     columns = [look.at.columns(family, item.constants)]
-    for name in bent:
+    for name in [name for name in family.continuous if np.isfinite(item.constants.get(name, np.inf))]:
         low, high = family.continuous[name]
         step = 1e-3 * (abs(item.constants[name]) if low > 0 else high - low)
         ends = [dict(item.constants) | {name: item.constants[name] + side * step} for side in (1.0, -1.0)]
         ahead, behind = (look.at.columns(family, end) @ item.values for end in ends)
         columns.append(((ahead - behind) / (2.0 * step))[:, None])
     together = np.column_stack(columns)
+    seen = together - look.basis @ (look.basis.T @ together)
+    cofactor = pseudo_covariance(seen)
+    sizes = {name: plausible_size(name, look.at.variables) for name in held if name in look.at.parameters}
+    moved = [look.at.parameters[name] * size for name, size in sizes.items() if size > 0]
+    if moved:
+        pulled = cofactor @ (seen.T @ np.stack(moved, axis=1))
+        cofactor = cofactor + pulled @ pulled.T / max(look.result.variance_factor, 1e-300)
     count = len(item.values)
-    return pseudo_covariance(together - look.basis @ (look.basis.T @ together))[:count, :count]
+    return cofactor[:count, :count]
+
+
+def plausible_size(name: str, variables: Mapping[str, Array]) -> float:
+    """Usual size of a deviation (m, rad), or of an elasticity by the deflection under the largest load."""
+    frame, kind = name.rsplit(".", 1)
+    if not kind.startswith("elastic_"):
+        return PLAUSIBLE_DEVIATION if kind in ("x", "y", "z", "roll", "pitch", "yaw") else 0.0
+    moment = variables.get(f"{identifier(frame)}_m{kind.removeprefix('elastic_')}")
+    largest = 0.0 if moment is None else float(np.max(np.abs(moment)))
+    return PLAUSIBLE_DEFLECTION / largest if largest > 1.0 else 0.0
 
 
 def _finding(
@@ -211,7 +238,7 @@ def _finding(
         if family.cause != "unknown":
             others = rivals(look.families, named, look.ranked, look.stacks, projected, look.named)
     factor = look.result.variance_factor
-    covariance = _covariance(look, item) * factor
+    covariance = _covariance(look, item, chosen.tied) * factor
     told, sigma = numeric_sigma(family.report, item.values, item.constants, covariance)
     excess = float(look.residual @ look.residual) - factor * look.result.redundancy
     explained = float(np.clip(projected @ look.residual / max(excess, 1e-300), 0.0, 1.0))
