@@ -89,6 +89,7 @@ def work(context: Context) -> Outcome:
         verify,
         settings_of(campaign),
         context.messages.info,
+        cross_elasticities(found),
     )
     outputs = [run.diagnosis]
     content = with_images(as_contract(diagnosis), images.findings, images.scans, images.noise)
@@ -128,6 +129,14 @@ def own_elasticities(found: IdentifiedRobot) -> tuple[str, ...]:
         return ()
     own = {f"{joint.name}.elastic_{joint.joint_kind}" for joint in found.model.joints if not joint.prismatic}
     return tuple(name for name in found.rejected_elasticities if name in own)
+
+
+def cross_elasticities(found: IdentifiedRobot) -> tuple[str, ...]:
+    """Elasticities across joints' axes that the identification took by evidence (standard model only)."""
+    if found.options.parameters != "standard":
+        return ()
+    own = {f"{joint.name}.elastic_{joint.joint_kind}" for joint in found.model.joints if not joint.prismatic}
+    return tuple(name for name in found.names if ".elastic_" in name and name not in own)
 
 
 def settings_of(campaign: Campaign) -> SelectionSettings:

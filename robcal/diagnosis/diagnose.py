@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -43,6 +43,7 @@ def diagnose(
     verify: Recording | None = None,
     settings: SelectionSettings = DEFAULTS,
     tell: Callable[[str], None] = lambda text: None,
+    optional: Iterable[str] = (),
 ) -> Diagnosis:
     """Find what a fitted robot model leaves out, name it, add it, and measure the gain on data kept out.
 
@@ -51,6 +52,9 @@ def diagnose(
     model : identified robot. free : names of its fitted parameters. tied : names eliminated as dependent.
     recording : the poses that were used to identify; no others touch any decision.
     verify : kept-out recording, used only to report the gain; without it whole blocks of poses are folded.
+    optional : fitted parameters that the identification took for the evidence in the residuals (elasticities across
+        axes). An effect that is left out makes such evidence as well, so where one is found the search is repeated
+        without them; those it needs come back into the model and are no findings.
     """
     start = time.perf_counter()
     free, tied = tuple(free), frozenset(tied)
@@ -60,17 +64,27 @@ def diagnose(
     verify = None if verify is None else relabelled(verify, swaps)
     thin = thinned(recording)
     noise = estimate_noise(model, thin, free)
+    silent = frozenset(optional) & set(free)
     chosen = select(model, noise.apply(thin), free, tied, settings, tell)
+    bare_model, bare = model, free
+    if chosen.accepted and silent:
+        bare_model = model.with_parameters(dict.fromkeys(silent, 0.0))
+        bare = tuple(name for name in free if name not in silent)
+        again = select(bare_model, noise.apply(thin), bare, tied, settings, tell)
+        if _information(again) < _information(chosen):
+            chosen = again
+        else:
+            bare_model, bare = model, free
     if chosen.accepted:
         # the first estimate contained the effects
-        noise = estimate_noise(model, chosen.recording, free, chosen.accepted)
+        noise = estimate_noise(bare_model, chosen.recording, bare, chosen.accepted)
     before = fit(model, chosen.recording, free)
     final = chosen.last.fit
     whole = chosen.recording
     if thin is not recording:
         whole = replace(recording, shared=None)
-        final = fit(model, whole, chosen.free, chosen.accepted)
-    findings = (*exchanged, *_findings(model, chosen, chosen.free, chosen.tied, verify, before))
+        final = fit(bare_model, whole, chosen.free, chosen.accepted)
+    findings = (*exchanged, *_findings(bare_model, chosen, silent, verify, before))
     heldout = (
         _error(chosen.recording, before, verify),
         _error(whole, final, verify),
@@ -90,7 +104,7 @@ def diagnose(
         family = last.families[last.top(np.ones(len(last.families), dtype=bool))]
         pattern = f"{family.where} {family.direction or ''} with {', '.join(family.covariates) or 'no covariate'}"
     return Diagnosis(
-        p_value=0.0 if exchanged else chosen.p_values[0] if chosen.p_values else chosen.last.p_value,
+        p_value=findings[0].p_value if findings else last.p_value,
         findings=findings,
         blunders=blunders,
         noise_estimated=float(np.sqrt(noise.factor)),
@@ -104,6 +118,14 @@ def diagnose(
         next_poses=poses,
         seconds=time.perf_counter() - start,
     )
+
+
+def _information(chosen: Selection) -> float:
+    """Schwarz' criterion of a search: square sum in units of the smaller variance factor, and its price in numbers."""
+    final = chosen.last.fit
+    rows = len(final.residual)
+    numbers = len(final.free) + sum(len(item.values) for item in final.accepted if item.family.displace is not None)
+    return rows * float(np.log(final.residual @ final.residual / rows)) + numbers * float(np.log(rows))
 
 
 def thinned(recording: Recording) -> Recording:
@@ -165,22 +187,20 @@ def _error(recording: Recording, fitted: Fit, verify: Recording | None) -> float
 
 
 def _findings(
-    model: RobotModel,
-    chosen: Selection,
-    free: Sequence[str],
-    tied: frozenset[str],
-    verify: Recording | None,
-    before: Fit,
+    model: RobotModel, chosen: Selection, silent: frozenset[str], verify: Recording | None, before: Fit
 ) -> tuple[Finding, ...]:
+    """What was accepted, without parameters of the standard model that merely came back (`silent`)."""
     final = chosen.last.fit
     findings = []
     error = _error(chosen.recording, before, verify)
     for k, item in enumerate(final.accepted):
+        if item.family.frees and silent.issuperset(item.family.frees):
+            continue
         others = tuple(other for j, other in enumerate(final.accepted) if j != k)
-        look = (
-            chosen.first if not others else analyse(fit(model, chosen.recording, free, others), chosen.recording, tied)
-        )
-        partial = fit(model, chosen.recording, free, final.accepted[: k + 1])
+        look = chosen.first
+        if others:
+            look = analyse(fit(model, chosen.recording, chosen.free, others), chosen.recording, chosen.tied)
+        partial = fit(model, chosen.recording, chosen.free, final.accepted[: k + 1])
         after = _error(chosen.recording, partial, verify)
         findings.append(_finding(look, item, chosen.p_values[k], (error, after), chosen))
         error = after

@@ -22,6 +22,8 @@ from robcal.robot.kernel import Kernel, PoseInputs
 from robcal.robot.model import RobotModel, Term
 from robcal.transforms import transform
 
+UNDETERMINED = 1e-6
+"""Directions of the scaled Jacobian below this share of the largest stay as they are: their sigma would be a radian."""
 SpatialObservations = FrameObservations | PointObservations | DistanceObservations | SensorPointObservations
 
 
@@ -271,10 +273,14 @@ def fit(
             jacobian = np.concatenate([jacobian, *(recording.whiten(shift, frames) for shift in shifts)], axis=1)
         return frames, residual, jacobian
 
+    brake = np.zeros((len(names), len(names) + sum(len(item.names) for item in direct)))
+    brake[np.arange(len(names)), np.arange(len(names))] = [_brake(name) for name in names]
     previous = np.inf
     for _ in range(iterations):
         _, residual, jacobian = linearised()
-        step = solve(jacobian, residual)[: len(columns)]
+        # steps are damped by the size that deviations can have: near-parallel axes leave directions that a full
+        # step would follow beyond all linearity
+        step = solve(np.vstack([jacobian, brake]), np.concatenate([residual, np.zeros(len(brake))]))[: len(columns)]
         theta[columns] += step
         change = float(np.sum((jacobian[:, : len(columns)] @ step) ** 2))
         if change < 1e-10 or abs(previous - change) < 1e-14:
@@ -300,6 +306,14 @@ def fit(
         frames,
         covariance,
     )
+
+
+def _brake(name: str) -> float:
+    """Reciprocal of the largest step that makes sense for a parameter; zero for amplitudes of causes."""
+    kind = name.rsplit(".", 1)[-1]
+    if kind.startswith("elastic_"):
+        return 1.0 / 2e-5
+    return 1.0 / 5e-3 if kind in ("x", "y", "z", "roll", "pitch", "yaw") and not name.startswith("payload.") else 0.0
 
 
 def _amplitudes(
@@ -334,7 +348,7 @@ def solve(jacobian: Array, residual: Array) -> Array:
     """Minimum-norm least-squares step, columns scaled to unit length first."""
     size = np.linalg.norm(jacobian, axis=0)
     safe = np.where(size > 0, size, 1.0)
-    return np.asarray(np.linalg.lstsq(jacobian / safe, residual, rcond=1e-10)[0] / safe)
+    return np.asarray(np.linalg.lstsq(jacobian / safe, residual, rcond=UNDETERMINED)[0] / safe)
 
 
 def pseudo_covariance(jacobian: Array) -> Array:
@@ -345,6 +359,6 @@ def pseudo_covariance(jacobian: Array) -> Array:
     size = np.linalg.norm(jacobian, axis=0)
     safe = np.where(size > 0, size, 1.0)
     _, singular, right = np.linalg.svd(jacobian / safe, full_matrices=False)
-    seen = singular > 1e-8 * singular.max(initial=0.0)
+    seen = singular > UNDETERMINED * singular.max(initial=0.0)
     root = (right[seen].T / singular[seen]) / safe[:, None]
     return root @ root.T
