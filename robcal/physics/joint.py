@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from robcal.physics.family import PER_KNM, Array, Basis, Constants, Family
-from robcal.physics.site import Joint, RobotSite, breaks, exponential_law
+from robcal.physics.site import LETTER_OF_KIND, Joint, RobotSite, breaks, exponential_law
 
 TORQUE_SCALES_NM = (5.0, 15.0, 50.0, 150.0, 500.0)
 THRESHOLDS_NM = (0.5, 5.0, 20.0, 80.0)
@@ -46,7 +46,7 @@ def _stiffness(site: RobotSite, joint: Joint) -> Iterator[Family]:
             "joint_compliance",
             "robot",
             joint.where,
-            LETTER[joint.own_angle],
+            LETTER_OF_KIND[joint.own_angle],
             (elastic,),
             (3e-6,),
             lambda v, c: {"compliance_deg_per_kNm": float(v[0]) * PER_KNM},
@@ -67,7 +67,7 @@ def _stiffness(site: RobotSite, joint: Joint) -> Iterator[Family]:
         "stiffness_nonlinear",
         "robot",
         joint.where,
-        LETTER[joint.own_angle],
+        LETTER_OF_KIND[joint.own_angle],
         ("cubic",) if linear_fitted else ("cubic", "linear"),
         (2e-4 / largest**3,) if linear_fitted else (2e-4 / largest**3, 3e-6),
         report,
@@ -75,9 +75,6 @@ def _stiffness(site: RobotSite, joint: Joint) -> Iterator[Family]:
         bases=(lambda c: (cubic,)) if linear_fitted else (lambda c: (cubic, linear)),
         covariates=(torque,),
     )
-
-
-LETTER = {"roll": "x", "pitch": "y", "yaw": "z", "x": "x", "y": "y", "z": "z"}
 
 
 def _lag(joint: Joint) -> float:
@@ -110,7 +107,7 @@ def _backlash(site: RobotSite, joint: Joint) -> Iterator[Family]:
         "backlash",
         "robot",
         joint.where,
-        LETTER[joint.own_angle],
+        LETTER_OF_KIND[joint.own_angle],
         ("width",),
         (_lag(joint),),
         lambda v, c: {name: float(v[0]) * joint.factor, **({"threshold_Nm": c["threshold_Nm"]} if c else {})},
@@ -130,7 +127,7 @@ def _hysteresis(site: RobotSite, joint: Joint) -> Iterator[Family]:
         "hysteresis",
         "robot",
         joint.where,
-        LETTER[joint.own_angle],
+        LETTER_OF_KIND[joint.own_angle],
         ("width",),
         (_lag(joint),),
         lambda v, c: {name: float(v[0]) * joint.factor},
@@ -151,7 +148,7 @@ def _lost_motion(site: RobotSite, joint: Joint) -> Iterator[Family]:
         "lost_motion",
         "robot",
         joint.where,
-        LETTER[joint.own_angle],
+        LETTER_OF_KIND[joint.own_angle],
         ("amplitude",),
         (2e-4,),
         lambda v, c: {"amplitude_deg": float(v[0]) * np.degrees(1.0), "torque_Nm": c["torque_Nm"]},
@@ -170,7 +167,7 @@ def _zero_jump(site: RobotSite, joint: Joint) -> Iterator[Family]:
         "zero_jump",
         "robot",
         joint.where,
-        LETTER[joint.own_angle],
+        LETTER_OF_KIND[joint.own_angle],
         ("jump",),
         (5e-4,),
         lambda v, c: {"pose": c["pose"], name: float(v[0]) * joint.factor},
@@ -201,7 +198,7 @@ def _eccentricity(site: RobotSite, joint: Joint) -> Iterator[Family]:
         "joint_eccentricity",
         "robot",
         joint.where,
-        LETTER[joint.own_angle],
+        LETTER_OF_KIND[joint.own_angle],
         ("cosine", "sine"),
         (3e-4, 3e-4),
         report,
@@ -226,7 +223,7 @@ def _ripple(site: RobotSite, joint: Joint) -> Iterator[Family]:
         "gear_ripple",
         "robot",
         joint.where,
-        LETTER[joint.own_angle],
+        LETTER_OF_KIND[joint.own_angle],
         ("cosine", "sine"),
         (1e-4, 1e-4),
         report,
@@ -243,7 +240,7 @@ def _ratio(site: RobotSite, joint: Joint) -> Iterator[Family]:
         "transmission_ratio",
         "robot",
         joint.where,
-        LETTER[joint.own_angle],
+        LETTER_OF_KIND[joint.own_angle],
         ("ratio",),
         (2e-4,),
         lambda v, c: {"ratio_error_ppm": float(v[0]) * 1e6},
@@ -268,7 +265,7 @@ def _coupling(joint: Joint, joints: list[Joint]) -> Iterator[Family]:
             "joint_coupling",
             "robot",
             joint.where,
-            LETTER[joint.own_angle],
+            LETTER_OF_KIND[joint.own_angle],
             ("ratio",),
             (3e-4,),
             report,
@@ -301,7 +298,7 @@ def _counterbalance(site: RobotSite, joints: list[Joint]) -> Iterator[Family]:
             "counterbalance",
             "robot",
             joint.where,
-            LETTER[joint.own_angle],
+            LETTER_OF_KIND[joint.own_angle],
             ("cosine", "sine"),
             (size, size),
             report,
@@ -324,7 +321,7 @@ def _zero_drift(site: RobotSite, joint: Joint) -> Iterator[Family]:
             "thermal_zero_drift",
             "robot",
             joint.where,
-            LETTER[joint.own_angle],
+            LETTER_OF_KIND[joint.own_angle],
             ("drift",),
             (3e-5,),
             lambda v, c: {f"{joint.unit}_per_K": float(v[0]) * joint.factor},
@@ -340,7 +337,7 @@ def _zero_drift(site: RobotSite, joint: Joint) -> Iterator[Family]:
             "thermal_zero_drift",
             "robot",
             joint.where,
-            LETTER[joint.own_angle],
+            LETTER_OF_KIND[joint.own_angle],
             ("drift",),
             (3e-4 / duration,),
             lambda v, c: {f"{joint.unit}_per_h": float(v[0]) * joint.factor, "tau_h": c["tau_h"]},
