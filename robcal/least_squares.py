@@ -188,24 +188,32 @@ def split_dependent(
     diagonal = np.diag(N).copy()
     largest = float(diagonal.max(initial=0.0))
     scale = np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
-    work = N / np.outer(scale, scale)
+    scaled = N / np.outer(scale, scale)
     kept: list[int] = []
     dropped: list[tuple[int, str, float]] = []
     floor = np.zeros(p) if limits is None else 1.0 / (np.asarray(limits) * scale) ** 2
-    for k in range(p):
-        pivot = work[k, k]
+    if p and largest > 0 and np.all(diagonal > 1e-30 * largest):
+        factor, failed = linalg.lapack.dpotrf(scaled, lower=1)
+        if not failed and np.all(np.diag(factor) ** 2 > np.maximum(relative_pivot, floor)):
+            kept = list(range(p))
+    rows = np.zeros((p, p), order="F")  # transposed Cholesky factor of the columns kept, grown column by column
+    for k in range(0 if not kept else p, p):
+        m = len(kept)
         if diagonal[k] <= 1e-30 * largest or diagonal[k] == 0.0:
             dropped.append((k, "no influence", np.inf))
             continue
+        part = scaled[kept, k]
+        if m:
+            part = linalg.blas.dtrsv(rows[:m, :m], part, trans=1)
+        pivot = float(scaled[k, k] - part @ part)
         if pivot <= relative_pivot:
             dropped.append((k, "dependent", np.inf))
             continue
         if pivot < floor[k]:
             dropped.append((k, "weak", float(1.0 / np.sqrt(pivot) / scale[k])))
             continue
+        rows[:m, m], rows[m, m] = part, np.sqrt(pivot)
         kept.append(k)
-        row = work[k, k + 1 :] / pivot
-        work[k + 1 :, k + 1 :] -= np.outer(work[k + 1 :, k], row)
     eliminated = []
     if limits is not None:
         kept, weak = _drop_weak_directions(N, kept, np.asarray(limits))
@@ -244,6 +252,11 @@ def _drop_weak_directions(N: Array, kept: list[int], limits: Array) -> tuple[lis
             across = N[np.ix_(free, bounded)]
             M = M - across.T @ linalg.lstsq(N[np.ix_(free, free)], across, cond=1e-14)[0]
         scaled = M * np.outer(limits[bounded], limits[bounded])
+        factor, failed = linalg.lapack.dpotrf(scaled, lower=1)
+        if not failed:
+            inverse = linalg.lapack.dtrtri(factor, lower=1)[0]
+            if np.einsum("ij,ij->j", inverse, inverse).max() < 1.0:
+                return kept, dropped
         values, vectors = linalg.eigh(scaled, check_finite=False)
         sigma = np.sqrt(np.sum(vectors**2 / np.maximum(values, 1e-14 * values[-1]), axis=1))
         if sigma.max() < 1.0:
@@ -271,6 +284,16 @@ class LinearStatistics:
     condition_raw: float
     correlations: Array
     singular_values: Array
+
+
+def cofactor(J: Array) -> Array:
+    """Inverse (p, p) of the normal matrix of a Jacobian (m, p) of full column rank, by QR of unit columns."""
+    if J.shape[1] == 0:
+        return np.zeros((0, 0))
+    scale = np.linalg.norm(J, axis=0)
+    R = linalg.qr(J / scale, mode="r", check_finite=False)[0][: J.shape[1]]
+    inverse = linalg.lapack.dtrtri(R)[0]
+    return np.asarray((inverse @ inverse.T) / np.outer(scale, scale))
 
 
 def linear_statistics(J: Array) -> LinearStatistics:
