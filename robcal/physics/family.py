@@ -9,12 +9,15 @@ gives the displacement of every observation per unit of each parameter.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from robcal.robot.terms import evaluate
 
 Array = NDArray[Any]
 """Real numbers, indices or masks: the diagnosis handles all three."""
@@ -28,12 +31,29 @@ PER_KNM = DEG * 1e3
 
 @dataclass(frozen=True)
 class Basis:
-    """`parameter * expression` is added to the `kind` (q, x .. yaw) of `frame`."""
+    """`parameter * expression` is added to the `kind` (q, x .. yaw) of `frame`.
+
+    The expression is a template with names for its constants: a template is read once, however many constants a scan
+    tries.
+    """
 
     frame: str
     kind: str
-    expression: str
+    template: str
     parameter: str
+    constants: Constants = field(default_factory=dict)
+
+    @property
+    def expression(self) -> str:
+        """The expression with its constants filled in, as a term of the kernel wants it."""
+        if not self.constants:
+            return self.template
+        names = "|".join(map(re.escape, self.constants))
+        return re.sub(rf"\b({names})\b", lambda found: f"({float(self.constants[found[0]])!r})", self.template)
+
+    def value(self, variables: Mapping[str, Array]) -> Array:
+        """Value of the expression at the variables."""
+        return evaluate(self.template, {**variables, **self.constants})
 
 
 @dataclass(frozen=True)

@@ -108,9 +108,10 @@ def breaks(index: Array, margin: int, most: int = MOST_BREAKS) -> tuple[tuple[fl
     return tuple(every[i] for i in chosen), every
 
 
-def exponential_law(start_s: float, duration_h: float, tau_h: float) -> str:
-    """Expression of a warming up that reaches `duration_h` (hours) at the end with time constant `tau_h`."""
+def exponential_law(start_s: float, duration_h: float, tau_h: float) -> tuple[str, dict[str, float]]:
+    """Template and constants of a warming up that reaches `duration_h` (hours) at the end, time constant `tau_h`."""
     if not np.isfinite(tau_h):
-        return f"((time_s - {start_s!r})/3600)"
+        return "((time_s - start_s)/3600)", {"start_s": start_s}
     scale = float(duration_h / -np.expm1(-duration_h / tau_h))
-    return f"({scale!r}*(1 - exp(-(time_s - {start_s!r})/{3600.0 * tau_h!r})))"
+    law = "(scale*(1 - exp((start_s - time_s)/tau_s)))"
+    return law, {"scale": scale, "start_s": start_s, "tau_s": 3600.0 * tau_h}
