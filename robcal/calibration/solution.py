@@ -26,6 +26,12 @@ MISFIT = 1.5
 """Sum of squares over that of all candidates together above which the elimination was too strict."""
 
 
+CONCEIVABLE = 5.0
+"""Deviations that robots may have, as a standard deviation in units of the plausible ones."""
+USUAL_STEP = 2.5
+"""Steps of the iteration that are common, in units of the plausible deviations."""
+
+
 @dataclass(frozen=True)
 class Solution:
     """Where the iteration ended, with which parameters, and what was left out why."""
@@ -96,7 +102,8 @@ class Engine:
         for round_ in range(4):
             problem = self.problem(state, kept, weights)
             state, summary = gauss_newton(
-                problem.linearise, problem.residuals, problem.retract, state, self.termination
+                problem.linearise, problem.residuals, problem.retract, state, self.termination,
+                USUAL_STEP * self._plausible(state, kept),
             )
             iterations += summary.iterations
             first = summary if first is None else first
@@ -179,17 +186,21 @@ class Engine:
     def _scatter(self, state: State, names: Sequence[str], weights: Array) -> float:
         """How far the stated covariance can be trusted: sigma0 of the data with all candidates free, one at least.
 
-        With all candidates, also the dependent ones (pseudo-inverse), or a parameter left out too early would make the
-        data look so bad that it could not come back.
+        With all candidates, also the dependent ones, or a parameter left out too early would make the data look so bad
+        that it could not come back. Only by deviations that robots have, though: what is missing in the model can
+        always be imitated by enormous ones that nearly cancel.
         """
         normals = self.normals(state, names, weights)
-        scale = np.sqrt(np.diag(normals.N))
-        scale[scale == 0] = 1.0
-        factor, order, rank, _ = linalg.lapack.dpstrf(normals.N / np.outer(scale, scale), tol=1e-10, lower=1)
-        free = order[:rank] - 1
-        along = linalg.blas.dtrsv(factor[:rank, :rank], (normals.b / scale)[free], lower=1)
-        left = normals.square - float(along @ along)
-        return max(1.0, float(np.sqrt(max(0.0, left) / max(1, self._rows(weights) - rank))))
+        size = CONCEIVABLE * self._plausible(state, names)
+        wide = ~np.isfinite(size)
+        size[wide] = 1.0 / np.sqrt(np.maximum(np.diag(normals.N)[wide], 1e-300))
+        scaled = normals.N * np.outer(size, size)
+        factor = linalg.cho_factor(scaled + np.diag(np.where(wide, 1e-10, 1.0)), lower=True, check_finite=False)
+        b = normals.b * size
+        left = normals.square - float(b @ linalg.cho_solve(factor, b, check_finite=False))
+        inverse = linalg.cho_solve(factor, scaled, check_finite=False)
+        used = float(np.trace(inverse))  # parameters that the data determine
+        return max(1.0, float(np.sqrt(max(0.0, left) / max(1.0, self._rows(weights) - used))))
 
     def _rows(self, weights: Array) -> int:
         """Measured numbers of the poses that are not left out."""
@@ -212,10 +223,12 @@ class Engine:
                 square += (value / sigma) ** 2
         return Normals(N, b, square)
 
-    def _limits(self, state: State, names: Sequence[str]) -> Array:
+    def _plausible(self, state: State, names: Sequence[str]) -> Array:
         at = [self._at[n] for n in names]
-        limits = limits_at(self._rules[0][at], self._rules[1][at], self.evaluator(state).moments)
-        return limits * (self.slack / self.scatter)
+        return limits_at(self._rules[0][at], self._rules[1][at], self.evaluator(state).moments)
+
+    def _limits(self, state: State, names: Sequence[str]) -> Array:
+        return self._plausible(state, names) * (self.slack / self.scatter)
 
     def _eliminate(
         self, state: State, names: Sequence[str], weights: Array, before: Mapping[str, Eliminated] | None = None
