@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
+from scipy import linalg, special
 
 from robcal.calibration.identifiability import Candidates, check_poses, choose_by_evidence, limit_rules, limits_at
 from robcal.calibration.problem import Evaluator, Problem, State, whitening
@@ -22,14 +22,12 @@ Array = NDArray[np.float64]
 
 LATE_SHARE = 0.2
 """Share of the plausible sigma below which a parameter may enter that was dependent at the start values."""
-MISFIT = 1.5
-"""Sum of squares over that of all candidates together above which the elimination was too strict."""
-
-
 CONCEIVABLE = 5.0
 """Deviations that robots may have, as a standard deviation in units of the plausible ones."""
 USUAL_STEP = 2.5
 """Steps of the iteration that are common, in units of the plausible deviations."""
+MISFIT_LEVEL = 1e-4
+"""p-value, of what all candidates together would take off the sum of squares, below which too much was eliminated."""
 
 
 @dataclass(frozen=True)
@@ -107,14 +105,16 @@ class Engine:
             )
             iterations += summary.iterations
             first = summary if first is None else first
-            self.scatter = self._scatter(state, names, weights)
+            self.scatter, least, free = self._with_all(state, names, weights)
             # What looks weak where it is linearised may matter further on: no look may make the fit worse than the
             # parameters that it saves are worth (Bayesian information criterion).
             worth = self._worth(summary.cost, len(kept), rows)
             worse = best is not None and worth > best[0]
             if best is None or not worse:
                 best = (worth, Solution(problem, state, tuple(kept), eliminated, {}, first, summary, iterations))
-            strict = 2.0 * best[1].summary.cost / self.scatter**2 > MISFIT * rows
+            gain = (2.0 * best[1].summary.cost - least) / self.scatter**2
+            left_out = max(1.0, free - len(best[1].names))
+            strict = special.chdtrc(left_out, max(0.0, gain)) < MISFIT_LEVEL
             if round_ == 3 or (worse and not strict):
                 break
             if strict and round_ > 0:  # something that matters was left out as weak: look again with more patience
@@ -183,12 +183,13 @@ class Engine:
         """Bayesian information criterion, in units of the data's own scatter; the smaller the better."""
         return 2.0 * cost / self.scatter**2 + parameters * float(np.log(max(2, rows)))
 
-    def _scatter(self, state: State, names: Sequence[str], weights: Array) -> float:
-        """How far the stated covariance can be trusted: sigma0 of the data with all candidates free, one at least.
+    def _with_all(self, state: State, names: Sequence[str], weights: Array) -> tuple[float, float, float]:
+        """What a fit with all candidates would leave: sigma0 (one at least), sum of squares, parameters used.
 
         With all candidates, also the dependent ones, or a parameter left out too early would make the data look so bad
         that it could not come back. Only by deviations that robots have, though: what is missing in the model can
-        always be imitated by enormous ones that nearly cancel.
+        always be imitated by enormous ones that nearly cancel. The first says how far the stated covariance can be
+        trusted.
         """
         normals = self.normals(state, names, weights)
         size = CONCEIVABLE * self._plausible(state, names)
@@ -197,10 +198,9 @@ class Engine:
         scaled = normals.N * np.outer(size, size)
         factor = linalg.cho_factor(scaled + np.diag(np.where(wide, 1e-10, 1.0)), lower=True, check_finite=False)
         b = normals.b * size
-        left = normals.square - float(b @ linalg.cho_solve(factor, b, check_finite=False))
-        inverse = linalg.cho_solve(factor, scaled, check_finite=False)
-        used = float(np.trace(inverse))  # parameters that the data determine
-        return max(1.0, float(np.sqrt(max(0.0, left) / max(1.0, self._rows(weights) - used))))
+        left = max(0.0, normals.square - float(b @ linalg.cho_solve(factor, b, check_finite=False)))
+        used = float(np.trace(linalg.cho_solve(factor, scaled, check_finite=False)))
+        return max(1.0, float(np.sqrt(left / max(1.0, self._rows(weights) - used)))), left, used
 
     def _rows(self, weights: Array) -> int:
         """Measured numbers of the poses that are not left out."""
