@@ -26,7 +26,7 @@ CONCEIVABLE = 5.0
 """Deviations that robots may have, as a standard deviation in units of the plausible ones."""
 USUAL_STEP = 2.5
 """Steps of the iteration that are common, in units of the plausible deviations."""
-MISFIT_LEVEL = 1e-4
+MISFIT_LEVEL = 1e-6
 """p-value, of what all candidates together would take off the sum of squares, below which too much was eliminated."""
 
 
