@@ -21,6 +21,8 @@ from robcal.errors import InvalidInput
 Array = NDArray[np.float64]
 State = TypeVar("State")
 
+RELEASE = 4.0
+"""Factor by which steps may grow after one that lowered the cost as foreseen, or shrink after a halved one."""
 RELATIVE_PIVOT = 1e-11  # squared; below this a column is numerically a combination of others
 
 
@@ -66,12 +68,17 @@ class SolveSummary:
     seconds: float = 0.0
 
 
-def solve_step(r: Array, J: Array) -> Array:
-    """Least-squares step (p,) by scaled normal equations; by the pseudo-inverse where they are singular."""
+def solve_step(r: Array, J: Array, usual: Array | None = None) -> Array:
+    """Least-squares step (p,) by scaled normal equations; by the pseudo-inverse where they are singular.
+
+    ``usual`` (p,): sizes that steps have; a step in units of these counts like a measured residual.
+    """
     scale = np.linalg.norm(J, axis=0)
     scale[scale == 0] = 1.0
     scaled = J / scale
     N, b = scaled.T @ scaled, scaled.T @ r
+    if usual is not None:
+        N[np.diag_indices_from(N)] += 1.0 / (usual * scale) ** 2
     try:
         factor = linalg.cho_factor(N, check_finite=False)
         step = linalg.cho_solve(factor, b, check_finite=False)
@@ -86,6 +93,7 @@ def gauss_newton(
     retract: Callable[[State, Array], State],
     start: State,
     settings: TerminationSettings = TerminationSettings(),
+    usual: Array | None = None,
 ) -> tuple[State, SolveSummary]:
     """Minimise ``|r|^2`` by Gauss-Newton steps, halved until the cost falls (thesis section 5.2).
 
@@ -96,6 +104,8 @@ def gauss_newton(
     retract : moves a state by a step (p,).
     start : first state.
     settings : termination.
+    usual : (p,) sizes that steps have, or None. Where the data leave a direction nearly open (almost parallel axes), a
+        full step would follow it beyond all linearity; one damped by these sizes does not (Levenberg 1944).
 
     Raises
     ------
@@ -113,8 +123,9 @@ def gauss_newton(
         seconds = time.perf_counter() - clock
         return SolveSummary(converged, len(history) - 1, why, history[0], cost, tuple(history), halvings, seconds)
 
+    room = 1.0
     for _ in range(settings.max_iterations):
-        step = solve_step(r, J)
+        step = solve_step(r, J, None if usual is None else room * usual)
         predicted = J @ step
         promise = float(r @ predicted - 0.5 * predicted @ predicted)
         small = settings.cost_tolerance * (1.0 + cost)
@@ -133,6 +144,8 @@ def gauss_newton(
             near = promise <= 1e-3 + 1e-6 * cost  # a few hundredths of a standard deviation
             return state, summary(near, "no fraction of the step lowers the cost")
         gained, state, cost = cost - new_cost, candidate, new_cost
+        # as long as steps keep their promise the damping fades, and the last ones are undamped
+        room = room * RELEASE if gained > 0.75 * promise else room if length == 1.0 else room / RELEASE
         history.append(cost)
         if gained <= small and length == 1.0:
             return state, summary(True, "the last step lowered the cost by less than the tolerance")

@@ -19,6 +19,7 @@ from robcal.diagnosis.scan import orthonormal_basis
 from robcal.errors import InvalidInput
 from robcal.physics.family import Array, Constants, Family, ObservationData
 from robcal.robot.kernel import Kernel, PoseInputs
+from robcal.robot.kernel_cache import kernel_of
 from robcal.robot.model import RobotModel, Term
 from robcal.transforms import transform
 
@@ -85,7 +86,7 @@ class Recording:
         return CommonNoise(columns if self.shared is None else self.shared.whiten(columns))
 
     @cached_property
-    def laws(self) -> dict[str, Array]:
+    def laws(self) -> dict[tuple[str | float, ...], Array]:
         """Values (n,) of expressions already evaluated that depend on the recording alone, not on the model."""
         return {}
 
@@ -254,7 +255,7 @@ def fit(
     """
     for number, item in enumerate(accepted):
         model = model.with_terms(terms_of(item, number))
-    kernel = Kernel(model, statics)
+    kernel = kernel_of(model, statics)
     inputs = recording.inputs(kernel)
     names = list(dict.fromkeys([*free, *(n for a in accepted for n in a.family.frees)]))
     names += [full for term in model.terms for full in term.parameter_names if full not in names]
@@ -273,8 +274,7 @@ def fit(
             jacobian = np.concatenate([jacobian, *(recording.whiten(shift, frames) for shift in shifts)], axis=1)
         return frames, residual, jacobian
 
-    brake = np.zeros((len(names), len(names) + sum(len(item.names) for item in direct)))
-    brake[np.arange(len(names)), np.arange(len(names))] = [_brake(name) for name in names]
+    brake = np.diag(largest_steps(names, len(names) + sum(len(item.names) for item in direct)))[: len(names)]
     previous = np.inf
     for _ in range(iterations):
         _, residual, jacobian = linearised()
@@ -306,6 +306,11 @@ def fit(
         frames,
         covariance,
     )
+
+
+def largest_steps(names: Sequence[str], columns: int) -> Array:
+    """Reciprocals (columns,) of the largest steps that make sense for named parameters; zero for amplitudes."""
+    return np.array([*map(_brake, names), *[0.0] * (columns - len(names))])
 
 
 def _brake(name: str) -> float:
