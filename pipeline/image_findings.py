@@ -53,7 +53,7 @@ def images_of(campaign: Campaign, run: Run) -> ImageFindings:
         names: Sequence[str] = campaign.poses.names if campaign.poses is not None else ()
         given = surveyed_or_given(campaign, run, orientation.body.name)
         files = {camera: s.start.camera if s.start else None for camera, s in campaign.cameras.items()}
-        data = station_data(orientation, tuple(names), given, files, _covariates(campaign))
+        data = station_data(orientation, tuple(names), given, files, image_covariates(campaign))
         marks: dict[str, StationMarks] = run.load("marks")
         swapped = exchanged_targets(orientation, marks, given)
         explained = frozenset(str(name) for f in swapped for name in (f.where, f.parameters["with"]))
@@ -67,7 +67,7 @@ def images_of(campaign: Campaign, run: Run) -> ImageFindings:
     return ImageFindings(tuple(findings), tuple(scans), max(noise))
 
 
-def _covariates(campaign: Campaign) -> Mapping[str, Array]:
+def image_covariates(campaign: Campaign) -> Mapping[str, Array]:
     """Temperatures and hours of all poses (without a robot they are read here: its other columns do not count)."""
     if campaign.poses is None:
         return {}

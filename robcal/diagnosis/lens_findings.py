@@ -102,7 +102,7 @@ def station_findings(
             continue
         before = float(np.sqrt(rms**2 * (1.0 + item.statistic / (2 * marks)))) if np.isfinite(statistic) else np.nan
         rivals: tuple[tuple[str, str], ...] = ()
-        if item.kind == "camera_moved" and len(orientation.names) == 2:
+        if item.kind == "camera_moved" and len(orientation.names) == 2 and not item.alone:
             other = next(name for name in orientation.names if name != item.where)
             rivals = (("camera_moved", other),)
         where = item.where.split(",")[0]
@@ -146,7 +146,11 @@ def _told(
     if item.kind == "camera_moved" and item.pose is not None:
         label = pose_names[item.pose]
         scale = np.r_[np.full(3, 1e3), np.full(3, np.degrees(1.0))]
-        values, sigmas = item.estimate * scale, spread * scale
+        moved, covariance = item.estimate, item.covariance
+        of_camera = orientation.exterior_camera == orientation.names.index(item.where)
+        if item.pose in orientation.exterior_first_pose[of_camera]:  # as adjusted, not as tested for
+            moved, covariance = orientation.movement(item.where, item.pose)
+        values, sigmas = moved * scale, np.sqrt(np.clip(np.diag(covariance), 0.0, None)) * scale
         told = {"pose": label, "shift_mm": values[:3].tolist(), "turn_deg": values[3:].tolist()}
         text = (
             f"Camera {item.where} moved before pose {label} by {np.linalg.norm(values[:3]):.3f} mm and "
