@@ -66,12 +66,17 @@ class SolveSummary:
     seconds: float = 0.0
 
 
-def solve_step(r: Array, J: Array) -> Array:
-    """Least-squares step (p,) by scaled normal equations; by the pseudo-inverse where they are singular."""
+def solve_step(r: Array, J: Array, usual: Array | None = None) -> Array:
+    """Least-squares step (p,) by scaled normal equations; by the pseudo-inverse where they are singular.
+
+    ``usual`` (p,): sizes that steps have; a step in units of these counts like a measured residual.
+    """
     scale = np.linalg.norm(J, axis=0)
     scale[scale == 0] = 1.0
     scaled = J / scale
     N, b = scaled.T @ scaled, scaled.T @ r
+    if usual is not None:
+        N[np.diag_indices_from(N)] += 1.0 / (usual * scale) ** 2
     try:
         factor = linalg.cho_factor(N, check_finite=False)
         step = linalg.cho_solve(factor, b, check_finite=False)
@@ -86,6 +91,7 @@ def gauss_newton(
     retract: Callable[[State, Array], State],
     start: State,
     settings: TerminationSettings = TerminationSettings(),
+    usual: Array | None = None,
 ) -> tuple[State, SolveSummary]:
     """Minimise ``|r|^2`` by Gauss-Newton steps, halved until the cost falls (thesis section 5.2).
 
@@ -96,6 +102,8 @@ def gauss_newton(
     retract : moves a state by a step (p,).
     start : first state.
     settings : termination.
+    usual : (p,) sizes that steps have, or None. Where the data leave a direction nearly open (almost parallel axes), a
+        full step would follow it beyond all linearity; one damped by these sizes does not (Levenberg 1944).
 
     Raises
     ------
@@ -114,7 +122,7 @@ def gauss_newton(
         return SolveSummary(converged, len(history) - 1, why, history[0], cost, tuple(history), halvings, seconds)
 
     for _ in range(settings.max_iterations):
-        step = solve_step(r, J)
+        step = solve_step(r, J, usual)
         predicted = J @ step
         promise = float(r @ predicted - 0.5 * predicted @ predicted)
         small = settings.cost_tolerance * (1.0 + cost)
@@ -188,24 +196,32 @@ def split_dependent(
     diagonal = np.diag(N).copy()
     largest = float(diagonal.max(initial=0.0))
     scale = np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
-    work = N / np.outer(scale, scale)
+    scaled = N / np.outer(scale, scale)
     kept: list[int] = []
     dropped: list[tuple[int, str, float]] = []
     floor = np.zeros(p) if limits is None else 1.0 / (np.asarray(limits) * scale) ** 2
-    for k in range(p):
-        pivot = work[k, k]
+    if p and largest > 0 and np.all(diagonal > 1e-30 * largest):
+        factor, failed = linalg.lapack.dpotrf(scaled, lower=1)
+        if not failed and np.all(np.diag(factor) ** 2 > np.maximum(relative_pivot, floor)):
+            kept = list(range(p))
+    rows = np.zeros((p, p), order="F")  # transposed Cholesky factor of the columns kept, grown column by column
+    for k in range(0 if not kept else p, p):
+        m = len(kept)
         if diagonal[k] <= 1e-30 * largest or diagonal[k] == 0.0:
             dropped.append((k, "no influence", np.inf))
             continue
+        part = scaled[kept, k]
+        if m:
+            part = linalg.blas.dtrsv(rows[:m, :m], part, trans=1)
+        pivot = float(scaled[k, k] - part @ part)
         if pivot <= relative_pivot:
             dropped.append((k, "dependent", np.inf))
             continue
         if pivot < floor[k]:
             dropped.append((k, "weak", float(1.0 / np.sqrt(pivot) / scale[k])))
             continue
+        rows[:m, m], rows[m, m] = part, np.sqrt(pivot)
         kept.append(k)
-        row = work[k, k + 1 :] / pivot
-        work[k + 1 :, k + 1 :] -= np.outer(work[k + 1 :, k], row)
     eliminated = []
     if limits is not None:
         kept, weak = _drop_weak_directions(N, kept, np.asarray(limits))
@@ -244,6 +260,11 @@ def _drop_weak_directions(N: Array, kept: list[int], limits: Array) -> tuple[lis
             across = N[np.ix_(free, bounded)]
             M = M - across.T @ linalg.lstsq(N[np.ix_(free, free)], across, cond=1e-14)[0]
         scaled = M * np.outer(limits[bounded], limits[bounded])
+        factor, failed = linalg.lapack.dpotrf(scaled, lower=1)
+        if not failed:
+            inverse = linalg.lapack.dtrtri(factor, lower=1)[0]
+            if np.einsum("ij,ij->j", inverse, inverse).max() < 1.0:
+                return kept, dropped
         values, vectors = linalg.eigh(scaled, check_finite=False)
         sigma = np.sqrt(np.sum(vectors**2 / np.maximum(values, 1e-14 * values[-1]), axis=1))
         if sigma.max() < 1.0:
@@ -271,6 +292,16 @@ class LinearStatistics:
     condition_raw: float
     correlations: Array
     singular_values: Array
+
+
+def cofactor(J: Array) -> Array:
+    """Inverse (p, p) of the normal matrix of a Jacobian (m, p) of full column rank, by QR of unit columns."""
+    if J.shape[1] == 0:
+        return np.zeros((0, 0))
+    scale = np.linalg.norm(J, axis=0)
+    R = linalg.qr(J / scale, mode="r", check_finite=False)[0][: J.shape[1]]
+    inverse = linalg.lapack.dtrtri(R)[0]
+    return np.asarray((inverse @ inverse.T) / np.outer(scale, scale))
 
 
 def linear_statistics(J: Array) -> LinearStatistics:

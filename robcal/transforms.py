@@ -27,12 +27,11 @@ def rotation_from_rpy(rpy: ArrayLike) -> Array:
     angles = np.asarray(rpy, dtype=float)
     cr, cp, cy = np.moveaxis(np.cos(angles), -1, 0)
     sr, sp, sy = np.moveaxis(np.sin(angles), -1, 0)
-    rows = [
-        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-        [-sp, cp * sr, cp * cr],
-    ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    out = np.empty((*angles.shape[:-1], 3, 3))
+    out[..., 0, 0], out[..., 0, 1], out[..., 0, 2] = cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr
+    out[..., 1, 0], out[..., 1, 1], out[..., 1, 2] = sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr
+    out[..., 2, 0], out[..., 2, 1], out[..., 2, 2] = -sp, cp * sr, cp * cr
+    return out
 
 
 def rpy_from_rotation(a_R_b: ArrayLike) -> Array:
@@ -88,9 +87,10 @@ def transform(a_T_b: ArrayLike, p_b: ArrayLike) -> Array:
 def skew(v: ArrayLike) -> Array:
     """Cross-product matrices ``[v]`` with ``[v] w = v x w``; ``(..., 3)`` to ``(..., 3, 3)``."""
     w = np.asarray(v, dtype=float)
-    zero = np.zeros_like(w[..., 0])
-    rows = [[zero, -w[..., 2], w[..., 1]], [w[..., 2], zero, -w[..., 0]], [-w[..., 1], w[..., 0], zero]]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    out = np.zeros((*w.shape[:-1], 3, 3))
+    out[..., 2, 1], out[..., 0, 2], out[..., 1, 0] = w[..., 0], w[..., 1], w[..., 2]
+    out[..., 1, 2], out[..., 2, 0], out[..., 0, 1] = -w[..., 0], -w[..., 1], -w[..., 2]
+    return out
 
 
 def exp_so3(omega: ArrayLike) -> Array:

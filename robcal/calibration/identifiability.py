@@ -108,8 +108,13 @@ def plausible_limits(model: RobotModel, moments: Array, names: Sequence[str]) ->
 
     ``moments`` are the poses' moments (n, m) in the order of :func:`robcal.robot.statics.moment_names`.
     """
-    largest = dict(zip(moment_names(model), np.abs(moments).max(axis=0, initial=0.0), strict=True))
-    limits = np.full(len(names), np.inf)
+    return limits_at(*limit_rules(model, names), moments)
+
+
+def limit_rules(model: RobotModel, names: Sequence[str]) -> tuple[Array, NDArray[np.intp]]:
+    """Limits (p,) that do not depend on the poses, and the column (p,) of the moment that the others depend on (-1)."""
+    limits, columns = np.full(len(names), np.inf), np.full(len(names), -1, dtype=np.intp)
+    moment = {name: k for k, name in enumerate(moment_names(model))}
     frames = {f.name for f in model.frames}
     priors = {f"{t.name}.{short}": 2.0 * sigma for t in model.terms for short, sigma in t.priors.items()}
     for k, name in enumerate(names):
@@ -122,9 +127,18 @@ def plausible_limits(model: RobotModel, moments: Array, names: Sequence[str]) ->
         elif kind in ("roll", "pitch", "yaw"):
             limits[k] = PLAUSIBLE_ANGLE
         else:
-            moment = largest[f"{identifier(frame)}_m{kind.removeprefix('elastic_')}"]
-            limits[k] = PLAUSIBLE_ANGLE / max(float(moment), 1e-9)
-    return limits
+            columns[k] = moment[f"{identifier(frame)}_m{kind.removeprefix('elastic_')}"]
+    return limits, columns
+
+
+def limits_at(limits: Array, columns: NDArray[np.intp], moments: Array) -> Array:
+    """The rules of :func:`limit_rules` with the largest moments of the poses (n, m) put in."""
+    elastic = columns >= 0
+    out = limits.copy()
+    if np.any(elastic):
+        largest = np.abs(moments).max(axis=0, initial=0.0)
+        out[elastic] = PLAUSIBLE_ANGLE / np.maximum(largest[columns[elastic]], 1e-9)
+    return out
 
 
 @dataclass(frozen=True)
@@ -164,44 +178,49 @@ def choose_by_evidence(N: Array, b: Array, rest: float, rows: int, forced: int, 
     m = p - forced
     alive = [k for k in range(m) if E[k, k] > 1e-10]
 
-    def fit(chosen: list[int]) -> tuple[float, Array]:
-        """Sum of squares and squared t numerators (drop of the sum by each) of a choice."""
-        if not chosen:
-            return rest, np.zeros(0)
-        inverse = np.linalg.inv(E[np.ix_(chosen, chosen)])
-        x = inverse @ c[chosen]
-        return rest - float(c[chosen] @ x), x**2 / np.diag(inverse)
+    n_cross = max(1, sum(1 for j in alive if j >= n_own))
+    level = np.where(np.arange(m) < n_own, OWN_AXIS_LEVEL, CROSS_AXIS_LEVEL / n_cross)
 
-    def level(k: int) -> float:
-        n_cross = max(1, sum(1 for j in alive if j >= n_own))
-        return OWN_AXIS_LEVEL if k < n_own else CROSS_AXIS_LEVEL / n_cross
+    def tests(chosen: list[int]) -> Array:
+        """p-values (m,): of removing each of the chosen, of adding each of the others; one for what is no candidate."""
+        values = np.ones(m)
+        others = [k for k in alive if k not in chosen]
+        total = rest
+        inverse: Array = np.zeros((0, 0))
+        across: Array = E[np.ix_(chosen, others)]
+        if chosen:
+            inverse = np.asarray(np.linalg.inv(E[np.ix_(chosen, chosen)]), dtype=float)
+            x = inverse @ c[chosen]
+            total = rest - float(c[chosen] @ x)
+            values[chosen] = p_value(x**2 / np.diag(inverse), total, len(chosen))
+        if others:
+            pivot = E[others, others] - np.einsum("ij,ij->j", across, inverse @ across)
+            left = c[others] - across.T @ (inverse @ c[chosen])
+            gain = np.where(pivot > 1e-12, left**2 / np.maximum(pivot, 1e-12), 0.0)
+            values[others] = p_value(gain, total - gain, len(chosen) + 1)
+        return values
 
-    def p_value(drop: float, total: float, n_chosen: int) -> float:
+    def p_value(drop: Array, total: Array | float, n_chosen: int) -> Array:
         freedom = rows - forced - n_chosen
-        return float(special.fdtrc(1, freedom, max(0.0, drop) * freedom / total)) if freedom > 0 and total > 0 else 1.0
+        if freedom <= 0:
+            return np.ones(len(drop))
+        positive = np.maximum(total, 1e-300)
+        p = special.fdtrc(1, freedom, np.maximum(drop, 0.0) * freedom / positive)
+        return np.where(np.asarray(total) > 0, p, 1.0)
 
     chosen = [k for k in alive if k < n_own]
+    values = tests(chosen)
     for _ in range(4 * m + 4):
-        total, drops = fit(chosen)
-        worst = [(p_value(d, total, len(chosen)) / level(k), k) for d, k in zip(drops, chosen, strict=True)]
-        if worst and max(worst)[0] > 1.0:
-            chosen.remove(max(worst)[1])
-            continue
-        gains = []
-        for k in (k for k in alive if k not in chosen):
-            new_total, new_drops = fit([*chosen, k])
-            gains.append((p_value(float(new_drops[-1]), new_total, len(chosen) + 1) / level(k), k))
-        if gains and min(gains)[0] < 0.5:  # stricter than for staying, so that nothing goes round in circles
-            chosen.append(min(gains)[1])
-            continue
-        break
-    values = np.ones(m)
-    total, drops = fit(chosen)
-    for d, k in zip(drops, chosen, strict=True):
-        values[k] = p_value(d, total, len(chosen))
-    for k in (k for k in alive if k not in chosen):
-        new_total, new_drops = fit([*chosen, k])
-        values[k] = p_value(float(new_drops[-1]), new_total, len(chosen) + 1)
+        urgency = values / level
+        worst = max(((urgency[k], k) for k in chosen), default=(0.0, -1))
+        if worst[0] > 1.0:
+            chosen.remove(worst[1])
+        else:
+            best = min(((urgency[k], k) for k in alive if k not in chosen), default=(1.0, -1))
+            if best[0] >= 0.5:  # stricter than for staying, so that nothing goes round in circles
+                break
+            chosen.append(best[1])
+        values = tests(chosen)
     return StepwiseChoice(tuple(sorted(chosen)), values)
 
 
@@ -239,12 +258,12 @@ def check_poses(q: Array, rows: int, parameters: Sequence[str]) -> None:
     ------
     NotIdentifiable : all poses alike, or no more measured numbers than parameters.
     """
-    distinct = int(repetitions(q, 1e-3).max(initial=-1)) + 1
-    if distinct < 2:
+    if len(q) == 0 or np.all(np.ptp(q, axis=0) < 1e-3):
         raise NotIdentifiable(
             f"all {len(q)} poses are alike: nothing about the joints can be identified, move every joint", parameters
         )
     if rows <= len(parameters):
+        distinct = int(repetitions(q, 1e-3).max(initial=-1)) + 1
         raise NotIdentifiable(
             f"{len(q)} poses ({distinct} distinct) give {rows} measured numbers for {len(parameters)} or more "
             "parameters: measure more poses or choose fewer parameters (model: parameters)",

@@ -79,10 +79,11 @@ class CellEvaluator(Evaluator):
         self.tool = [kernel.index[f"tool.{k}"] for k in GEOMETRIC_KINDS]
         self.theta[[*self.base, *self.tool]] = 0.0
         chain = kernel.with_references(np.eye(4), np.eye(4))
-        self.base_T_flange, _, self._moments = chain.evaluate(self.theta, evaluator.poses)
+        self.base_T_flange = chain.frames(self.theta, evaluator.poses)
+        self._moments = np.zeros((len(evaluator.poses), 0))
 
     def __call__(self, state: State) -> Evaluation:
-        """The evaluation at a state; the Jacobian is zero but for base and tool."""
+        """The evaluation at a state; the Jacobian is zero but for base and tool, the moments are left out."""
         for known, evaluation in self._memory:
             if known is state:
                 return evaluation
@@ -145,7 +146,9 @@ class Problem:
         """Whitened residuals (n, D) and Jacobian (n, D, p) by pose, zero where padded; priors left out."""
         at = self.evaluator(state)
         r = np.einsum("nij,nj->ni", self.whitener, at.r)
-        return r, (self.whitener @ at.B) @ at.J[:, :, self.columns]
+        # the kernel stores parameters before twists: taking columns there copies whole rows
+        J = np.take(np.swapaxes(at.J, 1, 2), self.columns, axis=1)
+        return r, (self.whitener @ at.B) @ np.swapaxes(J, 1, 2)
 
     def retract(self, state: State, step: Array) -> State:
         """Add a step to the free parameters and fold base and tool into their references."""

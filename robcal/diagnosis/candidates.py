@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from robcal.diagnosis.recording import Fit, Recording, observation_data
 from robcal.diagnosis.scan import Entry
-from robcal.physics.family import Array, Constants, Family, ObservationData
-from robcal.robot.terms import evaluate, names_in
+from robcal.physics.family import Array, Basis, Constants, Family, ObservationData
+from robcal.robot.terms import names_in
 
 
 @dataclass(frozen=True)
@@ -42,20 +43,22 @@ class Tangents:
         out = np.zeros((len(self.row_pose), len(names)))
         if family.bases is not None:
             for basis in family.bases(constants):
-                law = self._law(basis.expression)
+                law = self._law(basis)
                 out[:, names.index(basis.parameter)] += self.motion[basis.frame, basis.kind] * law[self.row_pose]
         return out
 
-    def _law(self, expression: str) -> Array:
+    def _law(self, basis: Basis) -> Array:
         """Value (n,) of an expression; what does not depend on moments is kept for later fits of the recording."""
-        known = self.recording.laws.get(expression)
+        key: tuple[str | float, ...] = (basis.template, *basis.constants.values())
+        known = self.recording.laws.get(key)
         if known is None:
-            known = np.broadcast_to(evaluate(expression, self.variables), self.variables["index"].shape)
-            if all(name in self.recording.covariates or name in self._joints for name in names_in(expression)):
-                self.recording.laws[expression] = known
+            known = np.broadcast_to(basis.value(self.variables), self.variables["index"].shape)
+            names = names_in(basis.template).difference(basis.constants)
+            if all(name in self.recording.covariates or name in self._joints for name in names):
+                self.recording.laws[key] = known
         return known
 
-    @property
+    @cached_property
     def _joints(self) -> frozenset[str]:
         return frozenset(f"q{k + 1}" for k in range(self.recording.q.shape[1]))
 
@@ -87,5 +90,5 @@ def entries(families: Sequence[Family], at: Tangents) -> list[Entry]:
         for g, constants in enumerate(family.grid):
             columns = at.columns(family, constants) * family.sizes(constants)
             if np.all(np.isfinite(columns)):
-                out.append(Entry(i, g, columns))
+                out.append(Entry(i, g, columns, family.positive))
     return out

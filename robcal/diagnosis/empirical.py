@@ -61,10 +61,16 @@ def _smooth(site: RobotSite, joint: Joint, kind: str, covariate: str) -> Family:
 
     def bases(c: Constants) -> tuple[Basis, ...]:
         count = int(c["bumps"])
-        centres = np.linspace(low, high, count)
+        centres = np.linspace(low, high, count).tolist()
         width = (high - low) / (count - 1)
         return tuple(
-            Basis(joint.frame, kind, f"exp(-0.5*(({covariate} - {float(x)!r})/{width!r})**2)", f"c{i}")
+            Basis(
+                joint.frame,
+                kind,
+                f"exp(-0.5*(({covariate} - centre)/width)**2)",
+                f"c{i}",
+                {"centre": x, "width": width},
+            )
             for i, x in enumerate(centres)
         )
 
@@ -92,10 +98,10 @@ def _product(joint: Joint, first: Joint, second: Joint) -> Family:
 
     def bases(c: Constants) -> tuple[Basis, ...]:
         n, m = c["first_order"], c["second_order"]
-        laws = [f"{f}({n!r}*{a})*{g}({m!r}*{b})" for f in ("cos", "sin") for g in ("cos", "sin")]
+        laws = [f"{f}(first_order*{a})*{g}(second_order*{b})" for f in ("cos", "sin") for g in ("cos", "sin")]
         if n == m == 1.0:
             laws.append(f"{a}*{b}")
-        return tuple(Basis(joint.frame, "q", law, f"c{i}") for i, law in enumerate(laws))
+        return tuple(Basis(joint.frame, "q", law, f"c{i}", c) for i, law in enumerate(laws))
 
     return Family(
         "unknown",
@@ -120,7 +126,7 @@ def _bump(site: RobotSite, joint: Joint) -> Family:
     grid = tuple({"centre": float(x), "width": w} for w in widths for x in np.arange(low, high + w, w) if w > 1e-6)
 
     def bases(c: Constants) -> tuple[Basis, ...]:
-        return (Basis(joint.frame, "q", f"exp(-0.5*((q{k} - {c['centre']!r})/{c['width']!r})**2)", "c0"),)
+        return (Basis(joint.frame, "q", f"exp(-0.5*((q{k} - centre)/width)**2)", "c0", c),)
 
     return Family(
         "unknown",

@@ -11,7 +11,6 @@ from robcal.diagnosis.result import Finding
 from robcal.physics.family import Array, Constants, Family
 from robcal.robot.kernel import PoseInputs
 from robcal.robot.model import RobotModel
-from robcal.robot.terms import evaluate
 
 COUNT = 15
 CANDIDATES = 400
@@ -87,7 +86,7 @@ class _frame_columns:
         names = family.names(constants)
         out = np.zeros((*self.parameters.shape[:2], len(names)))
         for basis in family.bases(constants) if family.bases is not None else ():
-            law = np.broadcast_to(evaluate(basis.expression, self._variables), self._variables["index"].shape)
+            law = np.broadcast_to(basis.value(self._variables), self._variables["index"].shape)
             out[:, :, names.index(basis.parameter)] += self._motion[f"{basis.frame}.{basis.kind}"] * law[:, None]
         return out
 

@@ -19,6 +19,7 @@ from robcal.diagnosis.scan import orthonormal_basis
 from robcal.errors import InvalidInput
 from robcal.physics.family import Array, Constants, Family, ObservationData
 from robcal.robot.kernel import Kernel, PoseInputs
+from robcal.robot.kernel_cache import kernel_of
 from robcal.robot.model import RobotModel, Term
 from robcal.transforms import transform
 
@@ -99,7 +100,7 @@ class Recording:
         return CommonNoise(columns if self.shared is None else self.shared.whiten(columns))
 
     @cached_property
-    def laws(self) -> dict[str, Array]:
+    def laws(self) -> dict[tuple[str | float, ...], Array]:
         """Values (n,) of expressions already evaluated that depend on the recording alone, not on the model."""
         return {}
 
@@ -270,7 +271,7 @@ def fit(
     """
     for number, item in enumerate(accepted):
         model = model.with_terms(terms_of(item, number))
-    kernel = Kernel(model, statics)
+    kernel = kernel_of(model, statics)
     inputs = recording.inputs(kernel)
     names = list(dict.fromkeys([*free, *(n for a in accepted for n in a.family.frees)]))
     names += [full for term in model.terms for full in term.parameter_names if full not in names]

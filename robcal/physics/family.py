@@ -9,12 +9,15 @@ gives the displacement of every observation per unit of each parameter.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from robcal.robot.terms import evaluate
 
 Array = NDArray[Any]
 """Real numbers, indices or masks: the diagnosis handles all three."""
@@ -28,12 +31,29 @@ PER_KNM = DEG * 1e3
 
 @dataclass(frozen=True)
 class Basis:
-    """`parameter * expression` is added to the `kind` (q, x .. yaw) of `frame`."""
+    """`parameter * expression` is added to the `kind` (q, x .. yaw) of `frame`.
+
+    The expression is a template with names for its constants: a template is read once, however many constants a scan
+    tries.
+    """
 
     frame: str
     kind: str
-    expression: str
+    template: str
     parameter: str
+    constants: Constants = field(default_factory=dict)
+
+    @property
+    def expression(self) -> str:
+        """The expression with its constants filled in, as a term of the kernel wants it."""
+        if not self.constants:
+            return self.template
+        names = "|".join(map(re.escape, self.constants))
+        return re.sub(rf"\b({names})\b", lambda found: f"({float(self.constants[found[0]])!r})", self.template)
+
+    def value(self, variables: Mapping[str, Array]) -> Array:
+        """Value of the expression at the variables."""
+        return evaluate(self.template, {**variables, **self.constants})
 
 
 @dataclass(frozen=True)
@@ -50,6 +70,8 @@ class Family:
     grid : values of the constants to be tried.
     continuous : constants that may be refined, with their bounds.
     ordered : constants with a long list of values of which the grid holds a part; refined among the values nearby.
+    positive : prior probability that the amplitude is positive (one parameter only): things give way and grow, rarely
+        the reverse.
     weight : prior weight of the whole family (a cause that may act at many places shares one weight among them).
     bases : robot families: constants to the expressions.
     frees : robot families: parameters the kernel has already, which the cause sets free (order of `parameters`).
@@ -67,6 +89,7 @@ class Family:
     grid: tuple[Constants, ...] = ({},)
     continuous: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     ordered: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    positive: float = 0.5
     weight: float = 1.0
     bases: Callable[[Constants], tuple[Basis, ...]] | None = None
     frees: tuple[str, ...] = ()

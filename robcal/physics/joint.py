@@ -11,7 +11,8 @@ from robcal.physics.family import PER_KNM, Array, Basis, Constants, Family
 from robcal.physics.site import LETTER_OF_KIND, Joint, RobotSite, breaks, exponential_law
 
 TORQUE_SCALES_NM = (5.0, 15.0, 50.0, 150.0, 500.0)
-THRESHOLDS_NM = (0.5, 5.0, 20.0, 80.0)
+MOST_THRESHOLDS = 60
+TRIED_THRESHOLDS = 8
 HIGHEST_RIPPLE_ORDER = 180
 
 
@@ -40,21 +41,22 @@ def _stiffness(site: RobotSite, joint: Joint) -> Iterator[Family]:
     if joint.prismatic or not site.varies(f"torque{k}", 1.0):
         return
     elastic = f"{joint.frame}.elastic_{joint.own_angle}"
+    torque = f"torque{k}"
     linear_fitted = elastic in site.fitted
-    if not linear_fitted and elastic not in site.tied:
+    if not linear_fitted:
         yield Family(
             "joint_compliance",
             "robot",
             joint.where,
             LETTER_OF_KIND[joint.own_angle],
             (elastic,),
-            (3e-6,),
+            (site.compliance(torque, 3e-6),),
             lambda v, c: {"compliance_deg_per_kNm": float(v[0]) * PER_KNM},
             "{where} gives way about its own axis by {compliance_deg_per_kNm:.3g} deg/kNm, which the model leaves out",
+            positive=0.98,
             frees=(elastic,),
         )
     held = float(site.model.parameters.get(elastic, 0.0))
-    torque = f"torque{k}"
     largest = float(np.max(np.abs(site.variables[torque])))
     cubic = Basis(joint.frame, "q", f"{torque}*{torque}*{torque}", "cubic")
     linear = Basis(joint.frame, "q", torque, "linear")
@@ -90,8 +92,9 @@ def _backlash(site: RobotSite, joint: Joint) -> Iterator[Family]:
     if not moved and not (loaded and np.min(torque) < 0 < np.max(torque)):
         return
     name = f"width_{joint.unit}"
-    thresholds = [t for t in THRESHOLDS_NM if t < largest] if loaded and moved else []
-    grid: tuple[Constants, ...] = tuple({"threshold_Nm": t} for t in thresholds) or ({},)
+    every = _thresholds(torque) if loaded and moved else ()
+    tried = np.unique(np.linspace(0, len(every) - 1, min(TRIED_THRESHOLDS, len(every))).round().astype(int))
+    grid: tuple[Constants, ...] = tuple({"threshold_Nm": every[i]} for i in tried) or ({},)
 
     def bases(c: Constants) -> tuple[Basis, ...]:
         lag = f"-0.5*approach{k}"
@@ -100,8 +103,8 @@ def _backlash(site: RobotSite, joint: Joint) -> Iterator[Family]:
         elif not moved:
             law = f"0.5*sign(torque{k})"
         else:
-            law = f"where(abs(torque{k}) > {c.get('threshold_Nm', 1e9)!r}, 0.5*sign(torque{k}), {lag})"
-        return (Basis(joint.frame, "q", law, "width"),)
+            law = f"where(abs(torque{k}) > threshold_Nm, 0.5*sign(torque{k}), {lag})"
+        return (Basis(joint.frame, "q", law, "width", c),)
 
     yield Family(
         "backlash",
@@ -113,9 +116,21 @@ def _backlash(site: RobotSite, joint: Joint) -> Iterator[Family]:
         lambda v, c: {name: float(v[0]) * joint.factor, **({"threshold_Nm": c["threshold_Nm"]} if c else {})},
         "{where} has {" + name + ":.4f} " + joint.unit + " of backlash the model does not know",
         grid=grid,
+        ordered={"threshold_Nm": every} if every else {},
+        positive=0.97,
         bases=bases,
         covariates=(f"approach{k}", f"torque{k}"),
     )
+
+
+def _thresholds(torque: Array) -> tuple[float, ...]:
+    """Torques between which recorded loads lie, below which a joint may count as unloaded; up to nine tenths of the
+    poses, because a joint that is unloaded in all of them lags behind, which is another cause."""
+    sizes = np.sort(np.abs(torque))
+    between = 0.5 * (sizes[1:] + sizes[:-1])[: int(0.9 * len(sizes))]
+    between = np.unique(np.concatenate([[0.5 * sizes[0]], between]))
+    chosen = np.unique(np.linspace(0, len(between) - 1, MOST_THRESHOLDS).round().astype(int))
+    return tuple(float(between[i]) for i in chosen)
 
 
 def _hysteresis(site: RobotSite, joint: Joint) -> Iterator[Family]:
@@ -132,6 +147,7 @@ def _hysteresis(site: RobotSite, joint: Joint) -> Iterator[Family]:
         (_lag(joint),),
         lambda v, c: {name: float(v[0]) * joint.factor},
         "{where} lags behind by {" + name + ":.4f} " + joint.unit + " between the two approach directions",
+        positive=0.97,
         bases=lambda c: (Basis(joint.frame, "q", f"-0.5*approach{k}", "width"),),
         covariates=(f"approach{k}",),
     )
@@ -155,7 +171,8 @@ def _lost_motion(site: RobotSite, joint: Joint) -> Iterator[Family]:
         "{where} loses {amplitude_deg:.4f} deg around zero load (lost motion, scale {torque_Nm:.0f} N m)",
         grid=tuple({"torque_Nm": s} for s in scales),
         continuous={"torque_Nm": (0.003 * largest, 2.0 * largest)},
-        bases=lambda c: (Basis(joint.frame, "q", f"tanh(torque{k}/{c['torque_Nm']!r})", "amplitude"),),
+        positive=0.7,
+        bases=lambda c: (Basis(joint.frame, "q", f"tanh(torque{k}/torque_Nm)", "amplitude", c),),
         covariates=(f"torque{k}",),
     )
 
@@ -174,15 +191,15 @@ def _zero_jump(site: RobotSite, joint: Joint) -> Iterator[Family]:
         "The zero of {where} jumped by {" + name + ":.4f} " + joint.unit + " at pose {pose}",
         grid=tuple({"pose": i} for i in first),
         ordered={"pose": every},
-        bases=lambda c: (Basis(joint.frame, "q", f"step(index - {c['pose'] - 0.5!r})", "jump"),),
+        bases=lambda c: (Basis(joint.frame, "q", "step(index - pose + 0.5)", "jump", c),),
         covariates=("index",),
     )
 
 
 def _harmonic(k: int, frame: str, kind: str, order: float) -> tuple[Basis, Basis]:
     return (
-        Basis(frame, kind, f"cos({order!r}*q{k})", "cosine"),
-        Basis(frame, kind, f"sin({order!r}*q{k})", "sine"),
+        Basis(frame, kind, f"cos(order*q{k})", "cosine", {"order": order}),
+        Basis(frame, kind, f"sin(order*q{k})", "sine", {"order": order}),
     )
 
 
@@ -291,7 +308,7 @@ def _counterbalance(site: RobotSite, joints: list[Joint]) -> Iterator[Family]:
 
         def bases(c: Constants, joint: Joint = joint, elastic: float = elastic) -> tuple[Basis, ...]:
             waves = _harmonic(joint.number, joint.frame, "q", 1.0)
-            return tuple(replace(wave, expression=f"{elastic!r}*{wave.expression}") for wave in waves)
+            return tuple(replace(wave, template=f"{elastic!r}*{wave.template}") for wave in waves)
 
         size = max(0.2 * largest, 1.0)
         yield Family(
@@ -308,6 +325,10 @@ def _counterbalance(site: RobotSite, joints: list[Joint]) -> Iterator[Family]:
             covariates=(f"q{joint.number}",),
             weight=0.7 if rank == 0 else 0.3 / (len(loaded) - 1),
         )
+
+
+def _warming(frame: str, kind: str, law: tuple[str, dict[str, float]], parameter: str) -> Basis:
+    return Basis(frame, kind, law[0], parameter, law[1])
 
 
 def _zero_drift(site: RobotSite, joint: Joint) -> Iterator[Family]:
@@ -344,7 +365,7 @@ def _zero_drift(site: RobotSite, joint: Joint) -> Iterator[Family]:
             "The zero of {where} drifts by {" + f"{joint.unit}_per_h" + ":.5f} " + joint.unit + " per hour",
             grid=tuple({"tau_h": share * duration} for share in (0.1, 0.25, 0.6, 3.0)),
             continuous={"tau_h": (0.02 * duration, 10.0 * duration)},
-            bases=lambda c: (Basis(joint.frame, "q", exponential_law(start, duration, c["tau_h"]), "drift"),),
+            bases=lambda c: (_warming(joint.frame, "q", exponential_law(start, duration, c["tau_h"]), "drift"),),
             covariates=("time_s",),
             weight=0.5,
         )

@@ -10,6 +10,8 @@ import numpy as np
 from robcal.physics.family import DEG, Array
 from robcal.robot.model import RobotModel
 
+TYPICAL_DEFLECTION = 2e-4
+"""rad under the largest load of a recording."""
 ANGLE_OF_AXIS = {"x": "roll", "y": "pitch", "z": "yaw"}
 LETTER_OF_KIND = {"roll": "x", "pitch": "y", "yaw": "z", "x": "x", "y": "y", "z": "z"}
 
@@ -89,6 +91,12 @@ class RobotSite:
         """Recorded temperatures that change by more than 0.2 K, enough to speak of."""
         return tuple(v for v in self.variables if v.startswith("temp_") and self.varies(v, 0.2))
 
+    def compliance(self, moment: str, least: float) -> float:
+        """Typical compliance (rad/(N m)) for a moment that was recorded: `least`, or more where loads are small, since
+        small robots are softer in proportion."""
+        largest = float(np.max(np.abs(self.variables.get(moment, np.zeros(1)))))
+        return max(least, TYPICAL_DEFLECTION / max(largest, 1.0))
+
     def duration_h(self) -> float:
         """Hours between the first and the last pose; zero without times."""
         times = self.variables.get("time_s")
@@ -108,9 +116,10 @@ def breaks(index: Array, margin: int, most: int = MOST_BREAKS) -> tuple[tuple[fl
     return tuple(every[i] for i in chosen), every
 
 
-def exponential_law(start_s: float, duration_h: float, tau_h: float) -> str:
-    """Expression of a warming up that reaches `duration_h` (hours) at the end with time constant `tau_h`."""
+def exponential_law(start_s: float, duration_h: float, tau_h: float) -> tuple[str, dict[str, float]]:
+    """Template and constants of a warming up that reaches `duration_h` (hours) at the end, time constant `tau_h`."""
     if not np.isfinite(tau_h):
-        return f"((time_s - {start_s!r})/3600)"
+        return "((time_s - start_s)/3600)", {"start_s": start_s}
     scale = float(duration_h / -np.expm1(-duration_h / tau_h))
-    return f"({scale!r}*(1 - exp(-(time_s - {start_s!r})/{3600.0 * tau_h!r})))"
+    law = "(scale*(1 - exp((start_s - time_s)/tau_s)))"
+    return law, {"scale": scale, "start_s": start_s, "tau_s": 3600.0 * tau_h}

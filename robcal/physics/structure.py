@@ -26,7 +26,7 @@ def structure_families(site: RobotSite) -> Iterator[Family]:
 def _link_compliance(site: RobotSite, joint: Joint) -> Iterator[Family]:
     for angle in joint.cross_angles if not joint.prismatic else ("roll", "pitch", "yaw"):
         name = f"{joint.frame}.elastic_{angle}"
-        if name in site.fitted or name in site.tied or not site.varies(f"{identifier(joint.frame)}_m{angle}", 1.0):
+        if name in site.fitted or not site.varies(f"{identifier(joint.frame)}_m{angle}", 1.0):
             continue
         yield Family(
             "link_compliance",
@@ -34,9 +34,10 @@ def _link_compliance(site: RobotSite, joint: Joint) -> Iterator[Family]:
             joint.where,
             LETTER_OF_KIND[angle],
             (name,),
-            (1e-6,),
+            (site.compliance(f"{identifier(joint.frame)}_m{angle}", 1e-6),),
             lambda v, c: {"compliance_deg_per_kNm": float(v[0]) * PER_KNM},
             "The link or bearing of {where} gives way about {direction} by {compliance_deg_per_kNm:.3g} deg/kNm",
+            positive=0.95,
             frees=(name,),
             covariates=(f"{identifier(joint.frame)}_m{angle}",),
         )
@@ -72,10 +73,10 @@ def _wobble(site: RobotSite, joint: Joint) -> Iterator[Family]:
     for angle in joint.cross_angles:
 
         def bases(c: Constants, kind: str = angle) -> tuple[Basis, ...]:
-            turn = f"{c['order']!r}*q{joint.number}"
+            turn = f"order*q{joint.number}"
             return (
-                Basis(joint.frame, kind, f"cos({turn})", "cosine"),
-                Basis(joint.frame, kind, f"sin({turn})", "sine"),
+                Basis(joint.frame, kind, f"cos({turn})", "cosine", c),
+                Basis(joint.frame, kind, f"sin({turn})", "sine", c),
             )
 
         def report(v: Array, c: Constants) -> dict[str, object]:
@@ -137,8 +138,8 @@ def _growth(site: RobotSite, joint: Joint) -> Iterator[Family]:
                 start: float = start,
                 duration: float = duration,
             ) -> tuple[Basis, ...]:
-                law = exponential_law(start, duration, c["tau_h"])
-                return (Basis(joint.frame, axis, f"{sign!r}*{law}", "growth"),)
+                law, constants = exponential_law(start, duration, c["tau_h"])
+                return (Basis(joint.frame, axis, f"{sign!r}*{law}", "growth", constants),)
 
             yield Family(
                 "thermal_growth",
@@ -164,9 +165,10 @@ def _base(site: RobotSite) -> Iterator[Family]:
             "base",
             None,
             ("compliance",),
-            (3e-7,),
+            (min(site.compliance(f"base_m{axis}", 3e-7) for axis in "xy"),),
             lambda v, c: {"compliance_deg_per_kNm": float(v[0]) * PER_KNM},
             "The foundation tilts under the overturning moment by {compliance_deg_per_kNm:.3g} deg/kNm",
+            positive=0.98,
             bases=lambda c: (
                 Basis("base", "roll", "base_mx", "compliance"),
                 Basis("base", "pitch", "base_my", "compliance"),
@@ -190,7 +192,7 @@ def _base(site: RobotSite) -> Iterator[Family]:
         "The base of the robot moved before pose {pose}",
         grid=tuple({"pose": i} for i in first),
         ordered={"pose": every},
-        bases=lambda c: tuple(Basis("base", kind, f"step(index - {c['pose'] - 0.5!r})", kind) for kind in kinds),
+        bases=lambda c: tuple(Basis("base", kind, "step(index - pose + 0.5)", kind, c) for kind in kinds),
         covariates=("index",),
     )
 

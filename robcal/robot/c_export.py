@@ -16,7 +16,9 @@ import numpy as np
 
 from robcal.errors import InvalidInput
 from robcal.robot import c_inverse_templates as ci
+from robcal.robot import c_numeric_templates as cn
 from robcal.robot import c_templates as c
+from robcal.robot.c_command_templates import COMMANDS
 from robcal.robot.c_expressions import array, function_body, number
 from robcal.robot.chain import Chain, chain_of
 from robcal.robot.compensation import FLIP, LARGEST_STEP, cell_frames
@@ -82,7 +84,7 @@ def export_c(model: RobotModel, prefix: str | None = None, statics: str = "one_s
         "\nstatic void real_robot(const double *q, const double *load, const double *covariate, double *T)\n{\n"
         + body
         + "\n}\n",
-        c.COMMANDS,
+        COMMANDS,
     ]
     source = "\n".join(parts)
     for key, text in values.items():
@@ -159,7 +161,7 @@ def _inverse_parts(chain: Chain) -> list[str]:
     parts.append(f"#define LARGEST_STEP {number(LARGEST_STEP)}\n#define FLIP {number(FLIP)}")
     if chain.n_joints < 6:
         parts.append(f"#define TILT_TOLERANCE {number(settings.tilt_tolerance)}")
-    parts.append(ci.NUMERIC)
+    parts.append(cn.NUMERIC)
     arm, first = carried_arm(chain)
     structure: Structure = find_structure(arm) if arm is not None else None
     if arm is None or structure is None:
@@ -167,7 +169,7 @@ def _inverse_parts(chain: Chain) -> list[str]:
         table = ",\n    ".join(array(s) for s in starts)
         start_table = f"static const double START[STARTS][N] = {{\n    {table}}};"
         parts += ["#define HELD 0", f"#define STARTS {len(starts)}", start_table]
-        return [*parts, ci.NUMERIC_INVERSE]
+        return [*parts, cn.NUMERIC_INVERSE]
     probe = perpendicular(arm.axes[5] if isinstance(structure, SphericalWrist) else arm.axes[1])
     parts += [
         f"#define FIRST {first}",

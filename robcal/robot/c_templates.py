@@ -1,7 +1,7 @@
-"""The fixed parts of exported C beside the inverse: header, vectors, chain, corrected commands.
+"""The fixed parts of exported C: header, vectors, chain. (The inverse and the commands have their own modules.)
 
 Plain C99 with ``math.h`` alone. ``@P@`` is the prefix of all names. The mathematics is that of
-:mod:`robcal.robot.chain` and :mod:`robcal.robot.compensation`; frames are 3 x 4 matrices, row by row.
+:mod:`robcal.robot.chain`; frames are 3 x 4 matrices, row by row.
 """
 
 HEADER = r"""/* @TITLE@
@@ -99,16 +99,6 @@ static void invert(const double *A, double *B)
     }
 }
 
-/* Rodrigues: u turned about w */
-static void rotate_cs(const double *w, double c, double s, const double *u, double *v)
-{
-    double d = dot(w, u) * (1.0 - c), x[3];
-    cross(w, u, x);
-    v[0] = c * u[0] + s * x[0] + d * w[0];
-    v[1] = c * u[1] + s * x[1] + d * w[1];
-    v[2] = c * u[2] + s * x[2] + d * w[2];
-}
-
 /* Twist (rho, omega) that moves A onto B, in the coordinates of A. */
 static void difference(const double *A, const double *B, double *twist)
 {
@@ -186,7 +176,7 @@ static void chain(const double *q, double *T, double *J)
     double R[12] = {1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0}, axes[N][3], points[N][3];
     int i, k;
     for (i = 0; i < N; ++i) {
-        double E[12], C[12], column[3], image[3];
+        double E[12], C[12], image[3];
         turn(R, AXIS[i], axes[i]);
         turn(R, POINT[i], points[i]);
         points[i][0] += R[3];
@@ -199,15 +189,18 @@ static void chain(const double *q, double *T, double *J)
             continue;
         }
         {
-            double c = cos(q[i]), s = sin(q[i]);
-            for (k = 0; k < 3; ++k) {
-                column[0] = column[1] = column[2] = 0.0;
-                column[k] = 1.0;
-                rotate_cs(AXIS[i], c, s, column, image);
-                E[k] = image[0];
-                E[4 + k] = image[1];
-                E[8 + k] = image[2];
-            }
+            /* Rodrigues */
+            double c = cos(q[i]), s = sin(q[i]), v = 1.0 - c;
+            const double *w = AXIS[i];
+            E[0] = c + v * w[0] * w[0];
+            E[1] = v * w[0] * w[1] - s * w[2];
+            E[2] = v * w[0] * w[2] + s * w[1];
+            E[4] = v * w[0] * w[1] + s * w[2];
+            E[5] = c + v * w[1] * w[1];
+            E[6] = v * w[1] * w[2] - s * w[0];
+            E[8] = v * w[0] * w[2] - s * w[1];
+            E[9] = v * w[1] * w[2] + s * w[0];
+            E[10] = c + v * w[2] * w[2];
         }
         turn(E, POINT[i], image);
         E[3] = POINT[i][0] - image[0];
@@ -236,166 +229,5 @@ static void chain(const double *q, double *T, double *J)
             J[6 * i + 3 + k] = T[k] * omega[0] + T[4 + k] * omega[1] + T[8 + k] * omega[2];
         }
     }
-}
-"""
-
-COMMANDS = r"""
-void @P@_forward(const double q[N], const @P@_conditions *conditions, double world_T_tool[12])
-{
-    double load[4];
-    load[0] = conditions->payload.mass;
-    load[1] = conditions->payload.cog[0];
-    load[2] = conditions->payload.cog[1];
-    load[3] = conditions->payload.cog[2];
-    real_robot(q, load, conditions->covariate, world_T_tool);
-}
-
-void @P@_nominal_forward(const double q[N], double base_T_tool[12])
-{
-    chain(q, base_T_tool, 0);
-}
-
-void @P@_base_from_world(const double world_T_x[12], double base_T_x[12])
-{
-    multiply(BASE_T_WORLD, world_T_x, base_T_x);
-}
-
-void @P@_world_from_base(const double base_T_x[12], double world_T_x[12])
-{
-    multiply(WORLD_T_BASE, base_T_x, world_T_x);
-}
-
-static int inside(const double *q)
-{
-    int i;
-    for (i = 0; i < N; ++i) {
-        if (!(q[i] <= UPPER[i] + SLACK && q[i] >= LOWER[i] - SLACK)) {
-            return 0;
-        }
-    }
-    return 1;
-}
-
-/* Joint step of the nominal robot by the twist r of its tool; 0 if a limit or a singularity forbids it. */
-static int step(const double *r, double *q)
-{
-    double T[12], J[6 * N], A[N][N], b[N], next[N], largest = 0.0;
-    int i, j, k;
-    chain(q, T, J);
-    for (i = 0; i < N; ++i) {
-        for (j = 0; j <= i; ++j) {
-            double s = 0.0;
-            for (k = 0; k < 6; ++k) {
-                s += (k < 3 ? 1.0 : ROTATION_LENGTH * ROTATION_LENGTH) * J[6 * i + k] * J[6 * j + k];
-            }
-            /* a track under the arm stays where it is */
-            A[i][j] = A[j][i] = (j < HELD) ? (i == j) : s + (i == j ? 1e-14 : 0.0);
-        }
-        b[i] = 0.0;
-        for (k = 0; k < 6 && i >= HELD; ++k) {
-            b[i] += (k < 3 ? 1.0 : ROTATION_LENGTH * ROTATION_LENGTH) * J[6 * i + k] * r[k];
-        }
-    }
-    if (!solve(A, b)) {
-        return 0;
-    }
-    for (i = 0; i < N; ++i) {
-        largest = fmax(largest, fabs(b[i]));
-    }
-    for (i = 0; i < N; ++i) {
-        next[i] = q[i] + b[i] * (largest > LARGEST_STEP ? LARGEST_STEP / largest : 1.0);
-    }
-    if (!inside(next)) {
-        return 0;
-    }
-    memcpy(q, next, sizeof next);
-    return 1;
-}
-
-/* One correction: F* <- F* Fh^-1 F with F* = K(q), then its joint values. */
-static int correct(const double *F, const double *real, double *q)
-{
-#if N >= 6
-    double Fh[12], T[12], inverse[12], gap[12], target[12], next[N];
-    int result, i;
-    multiply(BASE_T_WORLD, real, Fh);
-    chain(q, T, 0);
-    invert(Fh, inverse);
-    multiply(inverse, F, gap);
-    multiply(T, gap, target);
-    result = @P@_nominal_inverse(target, q, next);
-    for (i = 0; i < N && result == @P@_OK; ++i) {
-        /* a correction must not change the configuration */
-        if (fabs(next[i] - q[i]) > FLIP) {
-            result = @P@_OUT_OF_REACH;
-        }
-    }
-    if (result == @P@_OK) {
-        memcpy(q, next, sizeof next);
-    }
-    return result;
-#else
-    /* fewer than six joints: position before orientation, in joint space */
-    double target[12], r[6];
-    multiply(WORLD_T_BASE, F, target);
-    difference(real, target, r);
-    return step(r, q) ? @P@_OK : @P@_BEYOND_LIMITS;
-#endif
-}
-
-int @P@_first_order(const double world_T_tool[12], const @P@_conditions *conditions, const double near[N],
-                    double q[N], double *base_T_target)
-{
-    double F[12], real[12];
-    int result;
-    multiply(BASE_T_WORLD, world_T_tool, F);
-    result = @P@_nominal_inverse(F, near, q);
-    if (result == @P@_OK) {
-        @P@_forward(q, conditions, real);
-        result = correct(F, real, q);
-    }
-    if (base_T_target) {
-        chain(q, base_T_target, 0);
-    }
-    return result;
-}
-
-int @P@_exact(const double world_T_tool[12], const @P@_conditions *conditions, const double near[N],
-              double q[N], double *base_T_target, double *remaining)
-{
-    double F[12], real[12], r[6], back[6], size = HUGE_VAL, before;
-    int result, round, k, quick = 1;
-    multiply(BASE_T_WORLD, world_T_tool, F);
-    result = @P@_nominal_inverse(F, near, q);
-    for (round = 0; result == @P@_OK; ++round) {
-        @P@_forward(q, conditions, real);
-        difference(world_T_tool, real, r);
-        before = size;
-        size = 0.0;
-        for (k = 0; k < 6; ++k) {
-            size = (k < 3 || N >= 6) ? fmax(size, fabs(r[k])) : size;
-            back[k] = -r[k];
-        }
-        if (size <= 1e-10) {
-            break;
-        }
-        if (round == 25) {
-            result = @P@_NOT_CONVERGED;
-            break;
-        }
-        /* joint steps while they gain much; near singularities the closed form of the corrected target */
-        quick = quick && size < 0.25 * before;
-        if (!(quick && step(back, q))) {
-            quick = 0;
-            result = correct(F, real, q);
-        }
-    }
-    if (base_T_target) {
-        chain(q, base_T_target, 0);
-    }
-    if (remaining) {
-        *remaining = size < HUGE_VAL ? sqrt(dot(r, r)) : HUGE_VAL;
-    }
-    return result;
 }
 """

@@ -108,6 +108,23 @@ class Kernel:
             other.flange_T_tool = np.array(flange_T_tool, dtype=float)
         return other
 
+    def with_model(self, model: RobotModel) -> Kernel:
+        """The same kernel for a model that differs in the values of parameters and in references only.
+
+        Raises
+        ------
+        InvalidInput : the model has other parameters.
+        """
+        if parameter_names(model) != self.names:
+            raise InvalidInput(f"robot '{model.name}' has other parameters than the kernel of '{self.model.name}'")
+        other = self.with_references(
+            np.eye(4) if model.world_T_base is None else model.world_T_base,
+            np.eye(4) if model.flange_T_tool is None else model.flange_T_tool,
+        )
+        other.model = model
+        other.theta0 = other._start(model)
+        return other
+
     def graph(self) -> PoseGraph:
         """The symbolic graph of one pose."""
         if self._graph is None:

@@ -155,6 +155,7 @@ def gradient(expression: str, variables: Mapping[str, ArrayLike], wanted: Sequen
     return np.asarray(function.map(n)(points).full().T, dtype=float).reshape(n, len(wanted))
 
 
+@lru_cache(maxsize=4096)
 def identifier(name: str) -> str:
     """A frame's or column's name as it is written in expressions: other characters become underscores."""
     word = re.sub(r"\W", "_", name)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from robcal.physics.family import numeric_sigma
+from robcal.physics.family import Basis, numeric_sigma
 from robcal.physics.joint import joint_families
 from robcal.physics.site import RobotSite, exponential_law
 from robcal.physics.structure import structure_families
@@ -94,10 +94,20 @@ def test_backlash_rests_on_the_loaded_flank_and_lags_without_load() -> None:
 
 def test_warming_up_ends_at_its_duration() -> None:
     t = np.array([0.0, 3600.0, 7200.0])
-    law = evaluate(exponential_law(0.0, 2.0, 0.5), {"time_s": t})
+    law, straight = (
+        evaluate(template, {"time_s": t, **constants})
+        for template, constants in (exponential_law(0.0, 2.0, 0.5), exponential_law(0.0, 2.0, np.inf))
+    )
     assert law[0] == 0.0
     assert law[-1] == pytest.approx(2.0)
-    assert np.allclose(evaluate(exponential_law(0.0, 2.0, np.inf), {"time_s": t}), t / 3600)
+    assert np.allclose(straight, t / 3600)
+
+
+def test_constants_filled_in_give_what_the_template_gives() -> None:
+    angles = np.linspace(-2.0, 2.0, 7)
+    basis = Basis("axis1", "q", "cos(order*q1) + where(q1 > threshold, 1, 0)", "a", {"order": 17.0, "threshold": -0.5})
+    assert "order" not in basis.expression
+    assert np.allclose(evaluate(basis.expression, {"q1": angles}), basis.value({"q1": angles}), atol=1e-15)
 
 
 def test_fitted_parameters_are_no_candidates() -> None:
