@@ -83,6 +83,10 @@ class Recording:
         L = np.linalg.cholesky(self.observations.noise(frames))
         return np.asarray(L @ plain.reshape(len(L), -1, rows.shape[1]))
 
+    def beside_common(self, rows: Array) -> Array:
+        """Rows (m, ...) that are whitened pose by pose, beside the errors common to all poses."""
+        return rows if self._common is None else self._common.whiten(rows)
+
     def common_errors(self, residual: Array) -> Array | None:
         """Most probable errors common to all poses (k,), in their standard deviations, from whitened residuals (m,)."""
         return None if self._common is None else self._common.estimate(residual)
