@@ -16,7 +16,8 @@ from robcal.diagnosis.image_data import survey_data
 from robcal.diagnosis.image_diagnosis import ImageDiagnosis, ImageFinding, diagnose_images
 from robcal.diagnosis.image_exchange import exchanged_targets
 from robcal.diagnosis.image_station import given_points, station_data
-from robcal.diagnosis.lens_findings import station_findings, survey_findings
+from robcal.diagnosis.lens_findings import beyond_lenses, station_findings, survey_findings
+from robcal.photogrammetry.camera import Camera
 from robcal.photogrammetry.station_network import StationMarks, StationOrientation
 from robcal.photogrammetry.survey_types import SurveyResult
 from robcal.transforms import Array
@@ -36,6 +37,7 @@ def images_of(campaign: Campaign, run: Run) -> ImageFindings:
     findings: list[ImageFinding] = []
     scans: list[ImageDiagnosis] = []
     noise = [1.0]
+    cameras: dict[str, Camera] = {}
     if run.record("survey") is not None:
         for name, source in campaign.bodies.items():
             if source.survey is None or not run.has(f"survey_{name}"):
@@ -62,9 +64,10 @@ def images_of(campaign: Campaign, run: Run) -> ImageFindings:
         findings += station_findings(orientation, tuple(names), stated, data.inflation, explained)
         scans.append(diagnose_images(data))
         noise.append(orientation.sigma0)
+        cameras |= dict(zip(orientation.names, orientation.cameras, strict=True))
     for scan in scans:
         findings += scan.findings
-    return ImageFindings(tuple(findings), tuple(scans), max(noise))
+    return ImageFindings(beyond_lenses(findings, cameras), tuple(scans), max(noise))
 
 
 def image_covariates(campaign: Campaign) -> Mapping[str, Array]:

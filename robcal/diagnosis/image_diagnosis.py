@@ -127,9 +127,13 @@ def diagnose_images(data: ImageData, *, moves: bool = True, level: float = LEVEL
             listed = [entry for entry in listed if entry.family not in same]
         predicted = after
         added = np.concatenate([added, basis], axis=1)
+    left_over = min(last_p, dropped_p)
+    if left_over < ADEQUATE:
+        # images that are bent in a manner which nothing explains make single targets look displaced
+        findings = [f for f in findings if f.cause != "target_shifted" or f.p_value < left_over]
     floor = data.sigma_px
     p_value = findings[0].p_value if findings else last_p
-    return ImageDiagnosis(tuple(findings), p_value, min(last_p, dropped_p), (before, predicted, floor))
+    return ImageDiagnosis(tuple(findings), p_value, left_over, (before, predicted, floor))
 
 
 def _adequate(

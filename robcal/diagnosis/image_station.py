@@ -147,7 +147,7 @@ def station_data(
         body=carried.name,
         free=_free(orientation, start or {}),
         radii=np.nan_to_num(marks.radius),
-        sigma_px=float(np.sqrt(np.mean(unwhite**2) * 2.0)),
+        sigma_px=float(1.0 / np.sqrt(np.mean(design.whitening**2) * 2.0)),
         image_names=tuple(pose_names[int(p)] for p in orientation.poses),
         dots=not all(code == "corner" for code in carried.codes),
         covariates={
