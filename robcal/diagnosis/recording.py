@@ -294,8 +294,7 @@ def fit(
             jacobian = np.concatenate([jacobian, *(recording.whiten(shift, frames) for shift in shifts)], axis=1)
         return frames, residual, jacobian
 
-    brake = np.zeros((len(names), len(names) + sum(len(item.names) for item in direct)))
-    brake[np.arange(len(names)), np.arange(len(names))] = [_brake(name) for name in names]
+    brake = np.diag(largest_steps(names, len(names) + sum(len(item.names) for item in direct)))[: len(names)]
     previous = np.inf
     for _ in range(iterations):
         _, residual, jacobian = linearised()
@@ -328,6 +327,11 @@ def fit(
         covariance,
         recording.common_errors(residual),
     )
+
+
+def largest_steps(names: Sequence[str], columns: int) -> Array:
+    """Reciprocals (columns,) of the largest steps that make sense for named parameters; zero for amplitudes."""
+    return np.array([*map(_brake, names), *[0.0] * (columns - len(names))])
 
 
 def _brake(name: str) -> float:
