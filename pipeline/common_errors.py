@@ -8,14 +8,20 @@ from pipeline.stages.observations import RobotObservations, RobotRecording, Rows
 from robcal.calibration.observations import FrameObservations, PointObservations
 from robcal.photogrammetry.bodies import Body
 from robcal.photogrammetry.measured_points import MeasuredPoints
+from robcal.photogrammetry.station_network import StationOrientation
 from robcal.transforms import Array
 
 
 def common_errors(
     observations: RobotObservations, recording: RobotRecording, rows: Rows, body: Body | None,
-    points: MeasuredPoints | None,
+    points: MeasuredPoints | None, orientation: StationOrientation | None = None,
 ) -> Array | None:
-    """(m, 3, k) displacements of points by one standard deviation of the errors that station and body give to all."""
+    """Displacements by one standard deviation of the errors that station and body give to all.
+
+    (m, 3, k) of points, (m, 6, k) of the frames of an own station; None where nothing is known of such errors.
+    """
+    if isinstance(observations, FrameObservations) and orientation is not None:
+        return _of_frames(observations, rows, orientation)
     if not isinstance(observations, PointObservations):
         return None
     columns: list[Array] = []
@@ -32,11 +38,26 @@ def common_errors(
     return np.concatenate(columns, axis=2) if columns else None
 
 
+def _of_frames(observations: FrameObservations, rows: Rows, orientation: StationOrientation) -> Array:
+    """The share that cameras and body have in the poses of the station's adjustment: exactly its joint covariance.
+
+    With `V` a pose's own normal matrix and `C` its coupling with the unknowns common to all poses, an error `d` of
+    those moves the pose by `-inv(V) C' d`. Weakness: poses that the adjustment did not use count as free of it.
+    """
+    design = orientation.design
+    moved = -np.einsum("pij,gpj->pig", design.pose_inverse, design.coupling) @ _root(design.reduced_inverse)
+    place = {int(p): i for i, p in enumerate(orientation.poses)}
+    at = np.array([place.get(int(rows[p]), -1) for p in observations.pose])
+    return np.where(at[:, None, None] >= 0, moved[at], 0.0)
+
+
 def _root(covariance: Array) -> Array:
-    """Columns whose products sum to a covariance; directions without variance are left out."""
-    values, vectors = np.linalg.eigh(covariance)
-    keep = values > 1e-9 * values.max(initial=0.0)
-    return vectors[:, keep] * np.sqrt(values[keep])
+    """Columns whose products sum to a covariance (of mixed units); directions without variance are left out."""
+    size = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
+    safe = np.where(size > 0, size, 1.0)
+    values, vectors = np.linalg.eigh(covariance / np.outer(safe, safe))
+    keep = values > 1e-10 * values.max(initial=0.0)
+    return size[:, None] * vectors[:, keep] * np.sqrt(values[keep])
 
 
 def _turns(recording: RobotRecording, rows: Rows) -> Array | None:

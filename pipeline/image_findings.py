@@ -16,7 +16,8 @@ from robcal.diagnosis.image_data import survey_data
 from robcal.diagnosis.image_diagnosis import ImageDiagnosis, ImageFinding, diagnose_images
 from robcal.diagnosis.image_exchange import exchanged_targets
 from robcal.diagnosis.image_station import given_points, station_data
-from robcal.diagnosis.lens_findings import station_findings, survey_findings
+from robcal.diagnosis.lens_findings import beyond_lenses, station_findings, survey_findings
+from robcal.photogrammetry.camera import Camera
 from robcal.photogrammetry.station_network import StationMarks, StationOrientation
 from robcal.photogrammetry.survey_types import SurveyResult
 from robcal.transforms import Array
@@ -36,6 +37,7 @@ def images_of(campaign: Campaign, run: Run) -> ImageFindings:
     findings: list[ImageFinding] = []
     scans: list[ImageDiagnosis] = []
     noise = [1.0]
+    cameras: dict[str, Camera] = {}
     if run.record("survey") is not None:
         for name, source in campaign.bodies.items():
             if source.survey is None or not run.has(f"survey_{name}"):
@@ -53,7 +55,7 @@ def images_of(campaign: Campaign, run: Run) -> ImageFindings:
         names: Sequence[str] = campaign.poses.names if campaign.poses is not None else ()
         given = surveyed_or_given(campaign, run, orientation.body.name)
         files = {camera: s.start.camera if s.start else None for camera, s in campaign.cameras.items()}
-        data = station_data(orientation, tuple(names), given, files, _covariates(campaign))
+        data = station_data(orientation, tuple(names), given, files, image_covariates(campaign))
         marks: dict[str, StationMarks] = run.load("marks")
         swapped = exchanged_targets(orientation, marks, given)
         explained = frozenset(str(name) for f in swapped for name in (f.where, f.parameters["with"]))
@@ -62,12 +64,13 @@ def images_of(campaign: Campaign, run: Run) -> ImageFindings:
         findings += station_findings(orientation, tuple(names), stated, data.inflation, explained)
         scans.append(diagnose_images(data))
         noise.append(orientation.sigma0)
+        cameras |= dict(zip(orientation.names, orientation.cameras, strict=True))
     for scan in scans:
         findings += scan.findings
-    return ImageFindings(tuple(findings), tuple(scans), max(noise))
+    return ImageFindings(beyond_lenses(findings, cameras), tuple(scans), max(noise))
 
 
-def _covariates(campaign: Campaign) -> Mapping[str, Array]:
+def image_covariates(campaign: Campaign) -> Mapping[str, Array]:
     """Temperatures and hours of all poses (without a robot they are read here: its other columns do not count)."""
     if campaign.poses is None:
         return {}

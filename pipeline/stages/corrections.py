@@ -19,17 +19,28 @@ MEASURING = ("camera", "wire", "sensor")
 """Stages whose causes displace what is measured; those of the body are judged by the frames already."""
 
 
-def corrected(recording: RobotRecording, poses: Poses, diagnosis: Diagnosis) -> RobotRecording | None:
+def corrected(
+    recording: RobotRecording, poses: Poses, diagnosis: Diagnosis, shared: Array | None = None
+) -> RobotRecording | None:
     """The recording without the displacements found in the measuring system; None where there are none.
+
+    `shared` (m, 6): what the own station's errors, common to all poses, displace its frames (the first observations).
 
     Weakness: displaced targets of a body and exchanged ids are not taken back from frames.
     """
     found = [f for f in diagnosis.findings if f.family.displace is not None and f.family.stage in MEASURING]
-    if not found:
+    if not found and shared is None:
         return None
     kernel = Kernel(diagnosis.model, "converged")
 
+    own = recording.observations[0].pose
+
     def free(o: RobotObservations) -> RobotObservations:
+        if shared is not None and isinstance(o, FrameObservations) and np.array_equal(o.pose, own):
+            o = dataclasses.replace(o, world_T_tool=retract(o.world_T_tool, -shared))
+        return displaced(o) if found else o
+
+    def displaced(o: RobotObservations) -> RobotObservations:
         rows = Recording(poses.q, poses.payload, _covariates(poses), poses.names, o)
         inputs = rows.inputs(kernel)
         data = observation_data(

@@ -13,8 +13,9 @@ from pipeline.calibrated import Calibrated, with_folded_cell
 from pipeline.campaign import Campaign
 from pipeline.common_errors import common_errors
 from pipeline.image_findings import images_of
+from pipeline.moved_cameras import with_station_moves
 from pipeline.poses_table import Poses
-from pipeline.runs import write_json
+from pipeline.runs import Run, write_json
 from pipeline.stages.base import Context, Outcome, Stage, no_files
 from pipeline.stages.corrections import corrected
 from pipeline.stages.evidence import evidence_of
@@ -22,21 +23,27 @@ from pipeline.stages.identify import load_identification, require_robot
 from pipeline.stages.observations import RobotRecording, Rows
 from pipeline.tables import write_table
 from robcal.calibration.identification import IdentifiedRobot
+from robcal.calibration.observations import FrameObservations
 from robcal.diagnosis.contract import as_contract, with_images
 from robcal.diagnosis.diagnose import diagnose
 from robcal.diagnosis.image_diagnosis import ImageFinding
-from robcal.diagnosis.recording import Accepted, Recording, fit
+from robcal.diagnosis.recording import Accepted, Fit, Recording, fit
 from robcal.diagnosis.result import Diagnosis
 from robcal.diagnosis.selection import SelectionSettings
 from robcal.photogrammetry.bodies import Body
 from robcal.photogrammetry.measured_points import MeasuredPoints
-from robcal.transforms import Array
+from robcal.photogrammetry.station_network import StationOrientation
 
 NAME = "diagnose"
 
 
 def recording_for_diagnosis(
-    poses: Poses, recording: RobotRecording, rows: Rows, body: Body | None, points: MeasuredPoints | None = None
+    poses: Poses,
+    recording: RobotRecording,
+    rows: Rows,
+    body: Body | None,
+    points: MeasuredPoints | None = None,
+    orientation: StationOrientation | None = None,
 ) -> Recording | None:
     """The measurements of some poses in the form the diagnosis takes: the kind with the most of them."""
     chosen = recording.select(rows, detailed=True)
@@ -54,7 +61,8 @@ def recording_for_diagnosis(
         observations=observations,
         body=body.name if body is not None else "body",
         ids=tuple(int(i) for i in body.ids) if body is not None else (),
-        common=common_errors(observations, recording, rows, body, points),
+        common=common_errors(observations, recording, rows, body, points, orientation),
+        own_station=orientation is not None and isinstance(observations, FrameObservations),
     )
 
 
@@ -73,19 +81,24 @@ def work(context: Context) -> Outcome:
     _, poses = require_robot(campaign)
     identification = load_identification(run)
     points: MeasuredPoints | None = run.load("points") if run.has("points") else None
+    orientation = _own_station(run)
     found, measured = identification.robot(), identification.recording
     body = body_for_robot(campaign, run)
     # all of them: what a few poses have against the others may be a blunder, or an effect of one place in the workspace
-    recording = recording_for_diagnosis(poses, measured, identification.rows, body, points)
+    recording = recording_for_diagnosis(poses, measured, identification.rows, body, points, orientation)
     kept_out = np.array([i for i in measured.poses if poses.verify[i]], dtype=np.int64)
-    verify = recording_for_diagnosis(poses, measured, kept_out, body) if len(kept_out) else None
+    verify = recording_for_diagnosis(poses, measured, kept_out, body, points, orientation) if len(kept_out) else None
     if recording is None:
         return Outcome(notes=["nothing to diagnose"])
+    free, tied = found.names, (*found.eliminated, *own_elasticities(found))
+    if recording.own_station:
+        # told apart from the errors of the station, the frames show elasticities that were lost in them
+        free, tied = (*found.names, *own_elasticities(found)), tuple(found.eliminated)
     diagnosis = diagnose(
         found.model,
         recording,
-        found.names,
-        (*found.eliminated, *own_elasticities(found)),
+        free,
+        tied,
         verify,
         settings_of(campaign),
         context.messages.info,
@@ -93,26 +106,34 @@ def work(context: Context) -> Outcome:
     )
     outputs = [run.diagnosis]
     content = with_images(as_contract(diagnosis), images.findings, images.scans, images.noise)
+    if recording.own_station and orientation is not None:
+        content = with_station_moves(content, orientation.names, recording, diagnosis.model)
     write_json(run.diagnosis, content)
     table = content.get("next_poses")
     if table:
         write_table(run.next_poses, _columns(table))
         outputs.append(run.next_poses)
     calibrated: Calibrated = run.load("calibrated_identify")
-    if diagnosis.findings:
+    final = _final(diagnosis, recording)
+    shared = None if orientation is None else final.common
+    if diagnosis.findings or shared is not None:
+        # a robot that was fitted beside the errors of its station is better even where nothing is missing
+        at = [final.free.index(name) for name in diagnosis.free]
         calibrated = dataclasses.replace(
             calibrated,
             model=with_folded_cell(diagnosis.model),
             names=diagnosis.free,
-            covariance=_covariance(diagnosis, recording),
+            covariance=final.covariance[np.ix_(at, at)] * final.variance_factor,
             statics="converged",  # as the diagnosis fits
             diagnosed=True,
         )
     outputs.append(run.save(f"calibrated_{NAME}", calibrated))
-    without = corrected(measured, poses, diagnosis)
+    whole = recording_for_diagnosis(poses, measured, measured.poses, body, points, orientation)
+    of_station = None if shared is None or whole is None or whole.common is None else whole.common @ shared
+    without = corrected(measured, poses, diagnosis, of_station)
     if without is not None:
         outputs.append(run.save("corrected", without))
-    outputs.append(run.save("evidence", evidence_of(found.model, recording, found.names, verify, diagnosis)))
+    outputs.append(run.save("evidence", evidence_of(found.model, recording, free, verify, diagnosis)))
     told = [f.statement for f in images.findings] + [f.statement for f in diagnosis.findings]
     notes = told or ["nothing missing: the model explains the data"]
     outcome = _result(diagnosis) | {"mismatch": content["mismatch"]}
@@ -144,16 +165,23 @@ def settings_of(campaign: Campaign) -> SelectionSettings:
     return dataclasses.replace(SelectionSettings(), level=campaign.entry.diagnosis.level)
 
 
-def _covariance(diagnosis: Diagnosis, recording: Recording) -> Array:
-    """Covariance of the extended model's parameters: its terms are in the model, observation causes beside it."""
+def _own_station(run: Run) -> StationOrientation | None:
+    """The station whose frames are diagnosed; None where another system measured."""
+    if run.record("orient") is None or not run.has("orient"):
+        return None
+    found: StationOrientation = run.load("orient")
+    return found
+
+
+def _final(diagnosis: Diagnosis, recording: Recording) -> Fit:
+    """The extended model at the recording: its terms are in the model, observation causes beside it."""
     direct = [
         Accepted(f.family, f.constants, f.values, f.covariance)
         for f in diagnosis.findings
         if f.family.displace is not None
     ]
-    refit = fit(diagnosis.model, recording, diagnosis.free, direct)
-    at = [refit.free.index(name) for name in diagnosis.free]
-    return refit.covariance[np.ix_(at, at)] * refit.variance_factor
+    clean = recording.subset(~np.isin(np.array(recording.names), diagnosis.blunders))
+    return fit(diagnosis.model, clean, diagnosis.free, direct)
 
 
 def _columns(rows: Any) -> dict[str, list[object]]:

@@ -88,11 +88,13 @@ def evidence_of(
     ]
     after = fit(diagnosis.model, clean, diagnosis.free, direct)
     before = fit(model, recording, free)
-    looks = [(tangents(after, clean), after.residual, clean, False)]
+    # pose by pose: errors common to all poses are taken off as they were estimated
+    alone = replace(clean, common=None)
+    looks = [(tangents(after, alone), clean.beside_common(after.residual), alone, False)]
     if verify is not None:
         tested = relabelled(verify, swaps)
-        there = _elsewhere(after, tested)
-        looks.append((tangents(there, tested), _left_over(there, tested), tested, True))
+        there, alone = _elsewhere(after, tested), replace(tested, common=None)
+        looks.append((tangents(there, alone), _left_over(there, alone), alone, True))
         errors = [position_errors(r, f) for r, f in ((verify, before), (tested, after))]
         rows = verify.observations.pose
         names = verify.names
@@ -123,7 +125,10 @@ def _elsewhere(fitted: Fit, recording: Recording) -> Fit:
     """A fit looked at from other poses: nothing is fitted to them."""
     inputs = recording.inputs(fitted.kernel)
     frames, J = fitted.kernel.frames_and_jacobian(fitted.theta, inputs)
-    residual, _ = recording.linearise(frames, J[:, :, :1])
+    alone = replace(recording, common=None)
+    residual, _ = alone.linearise(frames, J[:, :, :1])
+    if recording.common is not None and fitted.common is not None:
+        residual = residual - alone.whiten(recording.common, frames) @ fitted.common
     observed = recording.observations.pose
     row_pose = np.repeat(observed, len(residual) // len(observed))
     return replace(fitted, inputs=inputs, frames=frames, residual=residual, row_pose=row_pose)

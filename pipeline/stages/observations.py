@@ -76,10 +76,12 @@ def build_recording(campaign: Campaign, run: Run, body: Body | None) -> RobotRec
         stated &= points.covariance is not None
         if len(frames.pose):
             observations.append(frame_observations(points, frames))
-            # What points of the own station tell about targets and cameras is judged in its images (they share the
-            # errors of its cameras); the robot is diagnosed on the frames, which carry that share in their weights.
-            own_station = points.station_jacobian is not None
-            detailed.append(observations[-1] if own_station else _used_points(points, frames, body) or observations[-1])
+            # What points of the own station tell about targets and cameras is judged in its images. The robot is
+            # diagnosed on the frames with their own noise alone: what they share is told apart (common_errors).
+            if points.station_jacobian is not None:
+                detailed.append(FrameObservations(frames.pose, frames.world_T_body, frames.covariance))
+            else:
+                detailed.append(_used_points(points, frames, body) or observations[-1])
     for table in campaign.measurements:
         if table.kind == "points" and observations and run.has("frames"):
             continue

@@ -12,12 +12,16 @@ import numpy as np
 from pipeline.bodies import surveyed_or_given
 from pipeline.camera_file import CameraFile, write_camera
 from pipeline.campaign import Campaign, ImageSource
+from pipeline.image_findings import image_covariates
 from pipeline.measurement_tables import MarksTable
+from pipeline.moved_cameras import which_moved, with_small_moves
 from pipeline.poses_table import Poses
 from pipeline.runs import Run
 from pipeline.stages.base import Context, Outcome, Stage
 from pipeline.stages.detect import DetectionIndex, load_detections
 from pipeline.stages.survey import located, size_of_marks
+from robcal.diagnosis.image_data import ImageData
+from robcal.diagnosis.image_station import station_data
 from robcal.errors import InvalidInput, RobcalError
 from robcal.imaging.detections import Detections
 from robcal.photogrammetry.bodies import Body
@@ -26,7 +30,7 @@ from robcal.photogrammetry.identify_station import identify_station
 from robcal.photogrammetry.measure_points import measure_points
 from robcal.photogrammetry.measured_points import MeasuredPoints
 from robcal.photogrammetry.station import orient_station
-from robcal.photogrammetry.station_network import StationMarks, StationOrientation
+from robcal.photogrammetry.station_network import StationMarks, StationOrientation, StationSettings
 
 NAME = "orient"
 
@@ -51,8 +55,18 @@ def work(context: Context) -> Outcome:
         if source.start is not None and source.start.world_T_camera is not None and name in marks
     }
     sizes = {name: _size(campaign.cameras[name], run, name) for name in marks}
+
+    def orient(settings: StationSettings) -> StationOrientation:
+        return orient_station(marks, body, {n: start[n] for n in marks}, sizes, stated, settings)
+
+    def data(orientation: StationOrientation) -> ImageData:
+        return station_data(orientation, poses.names, body, start, image_covariates(campaign))
+
     try:
-        orientation = orient_station(marks, body, {n: start[n] for n in marks}, sizes, stated)
+        orientation = orient(StationSettings())
+        if campaign.entry.diagnosis.enabled:
+            orientation = with_small_moves(orientation, orient, data)
+            orientation = which_moved(orientation, orient, campaign, marks)
     except RobcalError as error:
         raise located(error, f"{campaign.path}: station") from None
     outputs = [run.save(NAME, orientation), run.save("marks", marks)]
@@ -190,11 +204,19 @@ STAGE = Stage(
         *(body.file.path for body in campaign.bodies.values()),
         *(source.marks.path for source in campaign.cameras.values() if source.marks is not None),
         *(source.start_path for source in campaign.cameras.values() if source.start_path is not None),
+        *((campaign.poses.path,) if campaign.poses is not None else ()),
     ],
     settings=lambda campaign: [
-        campaign.entry.model_dump(include={"station"}),
+        campaign.entry.model_dump(include={"station", "diagnosis", "model", "payloads"}),
         list(campaign.poses.names) if campaign.poses else [],
     ],
     after=("detect", "survey"),
-    code=("robcal/photogrammetry", "robcal/least_squares.py", "robcal/transforms.py", "pipeline/stages/orient.py"),
+    code=(
+        "robcal/photogrammetry",
+        "robcal/diagnosis",
+        "robcal/least_squares.py",
+        "robcal/transforms.py",
+        "pipeline/stages/orient.py",
+        "pipeline/moved_cameras.py",
+    ),
 )

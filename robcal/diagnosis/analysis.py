@@ -58,7 +58,9 @@ def library_at(fit: Fit, recording: Recording, at: Tangents, tied: frozenset[str
     site = RobotSite(fit.model, at.variables, frozenset(fit.free), tied)
     present = {(a.family.key, tuple(sorted(a.constants.items()))) for a in fit.accepted}
     single = {a.family.key for a in fit.accepted if len(a.family.grid) == 1 or a.family.continuous}
-    named = [f for f in all_families(site, at.data, recording.ids, recording.body) if f.key not in single]
+    judged = {"camera_moved"} if recording.own_station else set()
+    known = all_families(site, at.data, recording.ids, recording.body)
+    named = [f for f in known if f.key not in single and f.cause not in judged]
     empirical = list(empirical_families(site)) if recording.observations_are_spatial else []
     return tuple(f for f in (*named, *empirical) if (f.key, tuple(sorted(f.grid[0].items()))) not in present)
 

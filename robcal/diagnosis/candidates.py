@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -20,7 +20,8 @@ class Tangents:
 
     Attributes
     ----------
-    motion : (frame, kind) to whitened columns (m,) of a unit of that number.
+    motion : (frame, kind) to columns (m,) of a unit of that number, whitened pose by pose: a law multiplies them before
+        errors common to all poses mix the rows.
     parameters : name of a kernel parameter to its whitened column (m,).
     variables : per pose. row_pose : (m,).
     """
@@ -45,7 +46,7 @@ class Tangents:
             for basis in family.bases(constants):
                 law = self._law(basis)
                 out[:, names.index(basis.parameter)] += self.motion[basis.frame, basis.kind] * law[self.row_pose]
-        return out
+        return self.recording.beside_common(out)
 
     def _law(self, basis: Basis) -> Array:
         """Value (n,) of an expression; what does not depend on moments is kept for later fits of the recording."""
@@ -67,7 +68,7 @@ def tangents(fit: Fit, recording: Recording) -> Tangents:
     """Tangents at a fit."""
     kernel = fit.kernel
     basis = kernel.scan_basis(fit.theta, fit.inputs)
-    _, motion = recording.linearise(fit.frames, basis.J)
+    _, motion = replace(recording, common=None).linearise(fit.frames, basis.J)
     keys = [tuple(name.rsplit(".", 1)) for name in basis.names]
     _, all_parameters = kernel.frames_and_jacobian(fit.theta, fit.inputs)
     _, whitened = recording.linearise(fit.frames, all_parameters)

@@ -83,3 +83,7 @@ class CommonNoise:
         """Inverse of :meth:`whiten`."""
         U, root = self._directions
         return np.asarray(rows + (U * (root - 1.0)) @ (U.T @ rows))
+
+    def estimate(self, whitened: Array) -> Array:
+        """Most probable errors (k,) in their standard deviations, from rows (m,) as :meth:`whiten` returns them."""
+        return np.asarray(self.columns.T @ self.whiten(whitened))

@@ -15,7 +15,10 @@ FOLDS = 8
 
 
 def position_errors(recording: Recording, fitted: Fit, accepted: Sequence[Accepted] | None = None) -> Array:
-    """Measured minus modelled positions (m_obs, 3), or lengths (m_obs, 1), with a model fitted elsewhere."""
+    """Measured minus modelled positions (m_obs, 3), or lengths (m_obs, 1), with a model fitted elsewhere.
+
+    Errors that all poses share (orientation of the station) are taken off as they were estimated there.
+    """
     kernel = fitted.kernel
     inputs = recording.inputs(kernel)
     frames = kernel.frames(fitted.theta, inputs)
@@ -29,6 +32,8 @@ def position_errors(recording: Recording, fitted: Fit, accepted: Sequence[Accept
         error = (obs.distance - np.linalg.norm(T[:, :3, 3], axis=1))[:, None]
     else:
         error = obs.p_world - transform(T, obs.p_sensor)
+    if recording.common is not None and fitted.common is not None:
+        error = error - (recording.common @ fitted.common)[:, :3]
     variables = kernel.variables(fitted.theta, inputs)
     for item in fitted.accepted if accepted is None else accepted:
         if item.family.displace is not None:
@@ -67,7 +72,7 @@ def cross_validated(recording: Recording, fitted: Fit, labels: Array) -> Array:
         test = fold_of_row == fold
         step = solve(fitted.jacobian[~test], fitted.residual[~test])
         predicted[test] = fitted.residual[test] - fitted.jacobian[test] @ step
-    return recording.unwhiten(predicted[:, None], fitted.frames)[:, : min(per, 3), 0]
+    return recording.local(predicted[:, None], fitted.frames)[:, : min(per, 3), 0]
 
 
 def noise_floor(recording: Recording, factor: float) -> float:

@@ -12,6 +12,8 @@ import numpy as np
 from scipy import linalg, sparse, stats
 
 from robcal.diagnosis.image_data import LENS_TERMS, ImageData
+from robcal.diagnosis.image_diagnosis import spread_of_others
+from robcal.diagnosis.scan import orthonormal_basis
 from robcal.photogrammetry.bodies import Body
 from robcal.photogrammetry.camera import Camera
 from robcal.photogrammetry.grouping import sum_by
@@ -145,7 +147,7 @@ def station_data(
         body=carried.name,
         free=_free(orientation, start or {}),
         radii=np.nan_to_num(marks.radius),
-        sigma_px=float(np.sqrt(np.mean(unwhite**2) * 2.0)),
+        sigma_px=float(1.0 / np.sqrt(np.mean(design.whitening**2) * 2.0)),
         image_names=tuple(pose_names[int(p)] for p in orientation.poses),
         dots=not all(code == "corner" for code in carried.codes),
         covariates={
@@ -205,21 +207,19 @@ def _lens_rows(orientation: StationOrientation, start: Mapping[str, Camera | Non
 
 
 def _target_spread(orientation: StationOrientation, operator: StationOperator, residual: Array) -> float:
-    """Median over the targets of their test against the stated coordinates, by its expectation for a right body."""
+    """How far the targets scatter about their stated coordinates, the worst set aside: one for a right body."""
     marks, design = orientation.marks, orientation.design
     seen = np.unique(marks.target)
-    statistic = []
+    bases: list[Array] = []
     for some in np.array_split(seen, max(1, len(seen) // 64)):
         shift = np.zeros((operator.A.shape[0], 3 * len(some)))
         for k, target in enumerate(some):
             rows = np.flatnonzero(marks.target == target)
             both = (2 * rows[:, None] + np.arange(2)).ravel()
             shift[both, 3 * k : 3 * k + 3] = design.by_point[rows].reshape(-1, 3)
-        P = operator.remove(shift).reshape(-1, len(some), 3).transpose(1, 0, 2)
-        inverse = np.linalg.pinv(np.swapaxes(P, 1, 2) @ P, rcond=1e-9, hermitian=True)
-        score = np.einsum("tri,r->ti", P, residual)
-        statistic.append(np.einsum("ti,tij,tj->t", score, inverse, score))
-    return float(np.median(np.concatenate(statistic)) / stats.chi2.median(3))
+        P = operator.remove(shift).reshape(-1, len(some), 3)
+        bases += [orthonormal_basis(P[:, k]) for k in range(len(some))]
+    return spread_of_others([basis for basis in bases if basis.shape[1]], residual)
 
 
 def _free(orientation: StationOrientation, start: Mapping[str, Camera | None]) -> tuple[frozenset[str], ...]:

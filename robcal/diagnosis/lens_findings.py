@@ -4,6 +4,7 @@ cameras that moved, targets that sit elsewhere."""
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy import stats
@@ -24,6 +25,10 @@ KIND = {"lens_radial": "radial distortion", "lens_tangential": "tangential disto
 LEVEL = 1e-4
 """Significance from which a lens group is a cause. Marks of an image share small errors, hence more than 1 %."""
 
+TANGENTIAL = 0.01
+AFFINITY = 2e-3
+"""Decentring (|p1|, |p2|) and relative difference of fx and fy beyond which no lens or sensor is built: glass or water
+in front of it bends images so."""
 EXCHANGED = 0.05
 """Two shifted targets are swapped if they miss each other's place by less than this share of their distance."""
 
@@ -102,11 +107,46 @@ def station_findings(
             continue
         before = float(np.sqrt(rms**2 * (1.0 + item.statistic / (2 * marks)))) if np.isfinite(statistic) else np.nan
         rivals: tuple[tuple[str, str], ...] = ()
-        if item.kind == "camera_moved" and len(orientation.names) == 2:
+        if item.kind == "camera_moved" and len(orientation.names) == 2 and not item.alone:
             other = next(name for name in orientation.names if name != item.where)
             rivals = (("camera_moved", other),)
         where = item.where.split(",")[0]
         yield ImageFinding(item.kind, stage, where, None, told, sigma, p_value, rivals, (before, rms), text)
+
+
+def beyond_lenses(findings: Sequence[ImageFinding], cameras: Mapping[str, Camera]) -> tuple[ImageFinding, ...]:
+    """Findings in which lens terms of a size that no lens has are told as what they stand for: refraction.
+
+    A camera looks through glass or water; in few images decentring and affinity take over most of what that does.
+    Where refraction is found on the same camera too, the terms are told beside it, as what it is hard to tell from.
+
+    Parameters
+    ----------
+    cameras : adjusted interior orientation by name, of the cameras that the findings speak of.
+    """
+    strange = [f for f in findings if f.where in cameras and _strange(f, cameras[f.where])]
+    out = [f for f in findings if f not in strange]
+    for where in dict.fromkeys(f.where for f in strange):
+        terms = [f for f in strange if f.where == where]
+        rivals = tuple((f.cause, where) for f in terms)
+        at = next((i for i, f in enumerate(out) if (f.cause, f.where) == ("refraction", where)), None)
+        if at is not None:
+            least = min(f.p_value for f in (out[at], *terms))
+            out[at] = replace(out[at], rivals=(*out[at].rivals, *rivals), p_value=least)
+            continue
+        formula = "; ".join(f"{name} = {value:.4g}" for f in terms for name, value in f.parameters.items())
+        term = {"variables": ["x_px", "y_px"], "kind": "formula", "formula": f"lens terms {formula}"}
+        best = min(terms, key=lambda f: f.p_value)
+        text = f"Camera {where} looks through glass or water: its images are bent more than any lens does ({formula})"
+        parameters: dict[str, object] = {"term": term}
+        out.append(replace(best, cause="refraction", parameters=parameters, sigma={}, rivals=rivals, statement=text))
+    return tuple(sorted(out, key=lambda f: f.cause != "refraction")) if strange else tuple(findings)
+
+
+def _strange(finding: ImageFinding, camera: Camera) -> bool:
+    if finding.cause == "lens_tangential":
+        return max(abs(camera.p1), abs(camera.p2)) > TANGENTIAL
+    return finding.cause == "lens_affinity" and abs(camera.fy - camera.fx) > AFFINITY * camera.fx
 
 
 def _with_swaps(evidence: Sequence[Evidence], given: Body | None) -> list[Evidence]:
@@ -146,7 +186,11 @@ def _told(
     if item.kind == "camera_moved" and item.pose is not None:
         label = pose_names[item.pose]
         scale = np.r_[np.full(3, 1e3), np.full(3, np.degrees(1.0))]
-        values, sigmas = item.estimate * scale, spread * scale
+        moved, covariance = item.estimate, item.covariance
+        of_camera = orientation.exterior_camera == orientation.names.index(item.where)
+        if item.pose in orientation.exterior_first_pose[of_camera]:  # as adjusted, not as tested for
+            moved, covariance = orientation.movement(item.where, item.pose)
+        values, sigmas = moved * scale, np.sqrt(np.clip(np.diag(covariance), 0.0, None)) * scale
         told = {"pose": label, "shift_mm": values[:3].tolist(), "turn_deg": values[3:].tolist()}
         text = (
             f"Camera {item.where} moved before pose {label} by {np.linalg.norm(values[:3]):.3f} mm and "

@@ -40,8 +40,10 @@ class Recording:
     names : of the poses.
     observations : one kind of measurement; `pose` in it counts rows of q.
     body : name of the measuring body; ids : its targets.
-    shared : repeatability of the joints as estimated. common : (m_obs, 3, k) displacements of points by one standard
-        deviation of errors common to all poses (orientation of the station, coordinates of the body).
+    shared : repeatability of the joints as estimated.
+    common : (m_obs, 3 | 6, k) displacements of points or frames by one
+        standard deviation of errors common to all poses (orientation of the station, coordinates of the body).
+    own_station : measured by cameras whose own images are diagnosed: their moves are told from those.
     """
 
     q: Array
@@ -53,6 +55,7 @@ class Recording:
     ids: tuple[int, ...] = ()
     shared: SharedNoise | None = None
     common: Array | None = None
+    own_station: bool = False
 
     def linearise(self, frames: Array, J: Array) -> tuple[Array, Array]:
         """Whitened residuals (m,) and Jacobian (m, p) at modelled frames (n, 4, 4) with right twists (n, 6, p)."""
@@ -72,6 +75,21 @@ class Recording:
         plain = plain if self.shared is None else self.shared.unwhiten(plain)
         L = np.linalg.cholesky(self.observations.noise(frames))
         return np.asarray(L @ plain.reshape(len(L), -1, rows.shape[1]))
+
+    def local(self, rows: Array, frames: Array) -> Array:
+        """Displacements (m_obs, k, p) of whitened rows (m, p) without what the errors common to all poses explain."""
+        plain = rows if self._common is None else self._common.whiten(rows)
+        plain = plain if self.shared is None else self.shared.unwhiten(plain)
+        L = np.linalg.cholesky(self.observations.noise(frames))
+        return np.asarray(L @ plain.reshape(len(L), -1, rows.shape[1]))
+
+    def beside_common(self, rows: Array) -> Array:
+        """Rows (m, ...) that are whitened pose by pose, beside the errors common to all poses."""
+        return rows if self._common is None else self._common.whiten(rows)
+
+    def common_errors(self, residual: Array) -> Array | None:
+        """Most probable errors common to all poses (k,), in their standard deviations, from whitened residuals (m,)."""
+        return None if self._common is None else self._common.estimate(residual)
 
     def _decorrelate(self, rows: Array) -> Array:
         rows = rows if self.shared is None else self.shared.whiten(rows)
@@ -169,6 +187,7 @@ class Fit:
     residual : (m,) whitened, measured - model. jacobian : (m, p) whitened.
     row_pose : (m,) pose of each row. inputs, frames : poses and modelled frames of the tool.
     covariance : (p, p) of the free parameters and the amplitudes of observation causes, variance factor one.
+    common : (k,) errors common to all poses as estimated, in their standard deviations (`Recording.common`).
     """
 
     model: RobotModel
@@ -182,6 +201,7 @@ class Fit:
     inputs: PoseInputs
     frames: Array
     covariance: Array
+    common: Array | None = None
 
     @property
     def redundancy(self) -> int:
@@ -305,6 +325,7 @@ def fit(
         inputs,
         frames,
         covariance,
+        recording.common_errors(residual),
     )
 
 

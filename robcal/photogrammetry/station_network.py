@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from robcal.errors import InvalidInput
 from robcal.photogrammetry.bodies import Body, IntArray
 from robcal.photogrammetry.camera import Camera
-from robcal.transforms import Array
+from robcal.transforms import Array, difference, invert
 
 GROUPS: Mapping[str, tuple[int, ...]] = {
     "focal": (0,),
@@ -100,7 +100,8 @@ class Evidence:
     ``kind``: 'camera_moved', 'target_shifted', 'target_swapped' (``where``: both ids), 'lens_radial',
     'lens_tangential', 'lens_affinity'; ``where``: camera or target; ``pose``: first
     pose concerned or None; ``estimate`` and ``covariance`` in the units of the kind (shift m, turn rad in the camera's
-    or the body's coordinates); ``statistic`` chi-square with ``degrees`` of freedom; ``statement`` a sentence.
+    or the body's coordinates); ``statistic`` chi-square with ``degrees`` of freedom; ``statement`` a sentence;
+    ``alone``: other data exclude that it was another camera.
     """
 
     kind: str
@@ -111,6 +112,7 @@ class Evidence:
     statistic: float
     degrees: int
     statement: str
+    alone: bool = False
 
 
 @dataclass(frozen=True)
@@ -259,6 +261,21 @@ class StationOrientation:
         rows = rows[np.argsort(self.exterior_first_pose[rows])]
         at = np.searchsorted(self.exterior_first_pose[rows], np.asarray(poses), side="right") - 1
         return rows[np.clip(at, 0, len(rows) - 1)]
+
+    def movement(self, camera: str, pose: int) -> tuple[Array, Array]:
+        """Change of a camera's exterior orientation (6,) at the pose from which an epoch starts, and its covariance.
+
+        Right perturbation of the orientation before (m, rad). Weakness: the covariance neglects the turn itself.
+        """
+        rows = np.flatnonzero(self.exterior_camera == self.names.index(camera))
+        rows = rows[np.argsort(self.exterior_first_pose[rows])]
+        k = int(np.flatnonzero(self.exterior_first_pose[rows] == pose)[0])
+        before, after = rows[k - 1], rows[k]
+        D = invert(self.world_T_exterior[before]) @ self.world_T_exterior[after]
+        C = self.covariance[: 6 * len(self.world_T_exterior), : 6 * len(self.world_T_exterior)]
+        C = C.reshape(len(self.world_T_exterior), 6, -1, 6)
+        between = C[before, :, after]
+        return difference(np.eye(4), D), C[after, :, after] + C[before, :, before] - between - between.T
 
     def camera_covariance(self, name: str) -> tuple[Array, Array]:
         """Covariances (6, 6) of a camera's exterior orientation at the first pose and (9, 9) of its interior one."""

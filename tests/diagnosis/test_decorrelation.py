@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from robcal.diagnosis.decorrelation import SharedNoise
+from robcal.diagnosis.decorrelation import CommonNoise, SharedNoise
 
 
 def test_shared_errors_become_white_and_come_back() -> None:
@@ -20,3 +20,15 @@ def test_shared_errors_become_white_and_come_back() -> None:
     assert np.allclose(W @ covariance @ W.T, np.eye(15), atol=1e-10)
     x = rng.normal(size=(15, 4))
     assert np.allclose(shared.unwhiten(shared.whiten(x)), x)
+
+
+def test_estimate_and_local_part_of_common_errors() -> None:
+    rng = np.random.default_rng(8)
+    columns = rng.normal(0, 3.0, (200, 4))
+    common = CommonNoise(columns)
+    errors = rng.standard_normal(4)
+    plain = columns @ errors + rng.standard_normal(200)
+    white = common.whiten(plain)
+    assert np.allclose(common.estimate(white), errors, atol=0.15)
+    # whitening twice applies the inverse covariance: what is left once the estimated errors are taken off
+    assert np.allclose(common.whiten(white), plain - columns @ common.estimate(white))

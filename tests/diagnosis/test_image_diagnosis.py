@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from robcal.diagnosis.image_data import survey_data
-from robcal.diagnosis.image_diagnosis import diagnose_images
+from robcal.diagnosis.image_diagnosis import diagnose_images, spread_of_others
 from robcal.diagnosis.image_exchange import exchanged_targets
 from tests.diagnosis.image_scenes import station, survey, told
 
@@ -94,3 +94,16 @@ def test_station_rows_are_an_orthogonal_projection():
     assert np.allclose(data.remove(once), once, atol=1e-8)
     assert np.allclose(once.T @ columns, once.T @ once, atol=1e-7)
     assert abs(data.residual @ data.residual / data.freedom - 1.0) < 0.2
+
+
+def test_spread_of_targets_is_not_spoilt_by_the_displaced_one() -> None:
+    rng = np.random.default_rng(5)
+    model = np.linalg.qr(rng.standard_normal((60, 12)))[0]  # few targets: each shift shows in the others' tests too
+    shifts = [rng.standard_normal((60, 3)) + 2.0 * rng.standard_normal((60, 1)) for _ in range(5)]
+    bases = [np.linalg.qr(s - model @ (model.T @ s))[0] for s in shifts]
+    noise = rng.standard_normal(60)
+    residual = noise - model @ (model.T @ noise)
+    clean = spread_of_others(bases, residual)
+    spoilt = spread_of_others(bases, residual + bases[2] @ np.array([40.0, -30.0, 20.0]))
+    assert clean < 3.0
+    assert spoilt < 3.0

@@ -11,7 +11,9 @@ import pytest
 from pipeline.campaign import read_campaign
 from pipeline.image_findings import images_of
 from pipeline.runs import Run
-from robcal.diagnosis.lens_findings import station_findings, survey_findings
+from robcal.diagnosis.image_diagnosis import ImageFinding
+from robcal.diagnosis.lens_findings import beyond_lenses, station_findings, survey_findings
+from robcal.photogrammetry.camera import Camera
 from robcal.photogrammetry.station_network import Evidence
 from tests.diagnosis.image_scenes import station, survey
 
@@ -89,3 +91,30 @@ def test_recorded_stereo_pairs_have_distorted_lenses_and_nothing_that_moved(tmp_
     found = [(c["cause"], c["where"]) for c in told["causes"]]
     assert set(found[:2]) == {("lens_radial", "left"), ("lens_radial", "right")}
     assert {cause for cause, _ in found} <= {"lens_radial", "lens_tangential", "lens_affinity"}
+
+
+def test_lens_terms_that_no_lens_has_are_refraction() -> None:
+    camera = Camera(1280, 1024, 6000.0, 6020.0, 640.0, 512.0, p1=0.0, p2=0.03)
+
+    def finding(cause: str, where: str, parameters: dict[str, object], p_value: float) -> ImageFinding:
+        return ImageFinding(cause, "camera", where, None, parameters, {}, p_value, (), (1.0, 0.8), cause)
+
+    told = [
+        finding("lens_tangential", "a", {"p1": 0.0, "p2": 0.03}, 1e-20),
+        finding("lens_affinity", "a", {"fy_minus_fx_px": 20.0}, 1e-9),
+        finding("lens_tangential", "b", {"p1": 0.0, "p2": 0.03}, 1e-20),
+        finding("refraction", "b", {"index": 1.3}, 1e-6),
+        finding("lens_radial", "b", {"k1": -0.1}, 1e-30),
+    ]
+    found = beyond_lenses(told, {"a": camera, "b": camera})
+    assert [(f.cause, f.where) for f in found] == [("refraction", "b"), ("refraction", "a"), ("lens_radial", "b")]
+    assert found[0].rivals == (("lens_tangential", "b"),)
+    assert found[0].parameters == {"index": 1.3}
+    assert set(found[1].rivals) == {("lens_tangential", "a"), ("lens_affinity", "a")}
+    assert "p2 = 0.03" in str(found[1].parameters["term"])
+
+
+def test_decentring_of_a_usual_lens_stays_a_lens_term() -> None:
+    camera = Camera(1280, 1024, 1500.0, 1500.6, 640.0, 512.0, p1=1e-3, p2=0.0)
+    told = [ImageFinding("lens_tangential", "camera", "a", None, {"p1": 1e-3}, {}, 1e-20, (), (1.0, 0.8), "")]
+    assert beyond_lenses(told, {"a": camera}) == tuple(told)
