@@ -1,5 +1,9 @@
 """Real recordings of a UR10 with a laser tracker: kept-out RMS before, after geometry, after elasticity, per series.
 
+Two further columns with what is periodic in the joints: the first four harmonics of each, and those up to the 60th that
+the identification poses ask for (forward choice by the Bayesian information criterion). The kept-out poses are only
+looked at for the table.
+
 Usage: ``python -m benchmarks.real_ur10 FOLDER`` where FOLDER holds ``robot.yaml`` and ``series_a`` .. ``series_d`` with
 ``poses.csv`` and ``frames.csv`` (Landgraf et al., IEEE CASE 2021; MIT licence).
 """
@@ -7,6 +11,7 @@ Usage: ``python -m benchmarks.real_ur10 FOLDER`` where FOLDER holds ``robot.yaml
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,13 +20,17 @@ import yaml
 
 from benchmarks.robots import table
 from robcal import transforms as tf
-from robcal.calibration.identification import IdentifyOptions, identify
-from robcal.calibration.observations import FrameObservations
+from robcal.calibration.identification import IdentifiedRobot, IdentifyOptions, identify
+from robcal.calibration.observations import FrameObservations, Stack
+from robcal.calibration.problem import Evaluator, Problem, State, whitening
 from robcal.calibration.verification import fit_nominal, verify
-from robcal.robot.kernel import Kernel
+from robcal.robot.kernel import Kernel, PoseInputs
 from robcal.robot.model import Frame, RobotModel, Term
 
 WAVE_PRIOR = 5e-4
+HIGHEST_ORDER = 60
+PRICE = 4.0  # of a harmonic, in units of log(rows): two coefficients, joint and order
+MOST_WAVES = 150
 DEFAULT_SIGMA, DEFAULT_SIGMA_ANGLE = 2e-5, np.deg2rad(0.005)
 
 
@@ -55,15 +64,54 @@ def read_series(folder: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nd
     return q, T, C, (table["set"] == "identify").to_numpy()
 
 
-def harmonics(model: RobotModel, orders: tuple[int, ...]) -> RobotModel:
-    """The model with harmonic errors of every joint: what eccentric encoders and gears leave."""
+def harmonics(model: RobotModel, waves: Sequence[tuple[int, int]]) -> RobotModel:
+    """The model with harmonic errors (joint counted from 1, order): what eccentric encoders and gears leave."""
+    joints = model.joints
     terms = [
-        Term(f"{f.name}.harmonic{m}", f.name, "q", f"a*cos({m}*q{k}) + b*sin({m}*q{k})", {"a": 0.0, "b": 0.0},
-             priors={"a": 5e-4, "b": 5e-4})
-        for k, f in enumerate(model.joints, 1)
-        for m in orders
+        Term(f"{joints[k - 1].name}.harmonic{m}", joints[k - 1].name, "q", f"a*cos({m}*q{k}) + b*sin({m}*q{k})",
+             {"a": 0.0, "b": 0.0}, priors={"a": WAVE_PRIOR, "b": WAVE_PRIOR})
+        for k, m in waves
     ]
     return model.with_terms(terms)
+
+
+def waves_by_evidence(robot: IdentifiedRobot, poses: PoseInputs, measured: FrameObservations) -> list[tuple[int, int]]:
+    """Joints and orders whose harmonics lower the sum of squares by more than they cost, one after the other."""
+    inside = np.flatnonzero(robot.used)
+    stack = Stack([measured.subset(inside)], len(inside))
+    poses = poses.subset(inside)
+    evaluator = Evaluator(robot.kernel, poses, stack)
+    state = State(robot.full_theta, robot.kernel.world_T_base, robot.kernel.flange_T_tool)
+    white = whitening(evaluator, state)
+    r, A = Problem(evaluator, robot.columns, white).blocks(state)
+    Jq = white @ evaluator(state).B @ robot.kernel.joint_jacobian(robot.full_theta, poses)
+    names = [(k, m) for k in range(1, poses.q.shape[1] + 1) for m in range(1, HIGHEST_ORDER + 1)]
+    columns = [Jq[:, :, k - 1] * wave(m * poses.q[:, k - 1])[:, None] for k, m in names for wave in (np.cos, np.sin)]
+    p, rows = A.shape[2], r.size
+    J = np.concatenate([A, np.stack(columns, axis=2)], axis=2).reshape(rows, -1)
+    scale = np.linalg.norm(J, axis=0)
+    J /= scale
+    N, b, rest = J.T @ J, J.T @ r.ravel(), float(r.ravel() @ r.ravel())
+    chosen: list[int] = []
+    for _ in range(MOST_WAVES):
+        inside_columns = [*range(p), *(p + 2 * i + e for i in chosen for e in (0, 1))]
+        inverse = np.linalg.inv(N[np.ix_(inside_columns, inside_columns)] + 1e-9 * np.eye(len(inside_columns)))
+        x = inverse @ b[inside_columns]
+        left = b - N[:, inside_columns] @ x
+        total = rest - float(b[inside_columns] @ x)
+        gains = np.zeros(len(names))
+        for i in range(len(names)):
+            if i in chosen:
+                continue
+            two = [p + 2 * i, p + 2 * i + 1]
+            across = N[np.ix_(inside_columns, two)]
+            pivot = N[np.ix_(two, two)] - across.T @ inverse @ across
+            gains[i] = left[two] @ np.linalg.solve(pivot + 1e-6 * np.eye(2), left[two])
+        best = int(np.argmax(gains))
+        if gains[best] < PRICE * total / rows * np.log(rows):
+            break
+        chosen.append(best)
+    return sorted(names[i] for i in chosen)
 
 
 def main() -> None:
@@ -72,35 +120,39 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     folder = parser.parse_args().folder
     plain = read_chain(folder / "robot.yaml")
-    wavy = harmonics(plain, (1, 2, 3, 4))
+    low = [(k, m) for k in range(1, 7) for m in (1, 2, 3, 4)]
     rows: list[list[object]] = []
+    orders: list[str] = []
     for series in "abcd":
         q, T, C, inside = read_series(folder / f"series_{series}")
         everything = FrameObservations(np.arange(len(q)), T, C)
         train, test = everything.subset(inside), everything.subset(~inside)
         row: list[object] = [series.upper(), int(inside.sum()), int((~inside).sum())]
-        elastic = 0
-        for model, choice in ((plain, None), (plain, "geometry"), (plain, "standard"), (wavy, "standard")):
-            kernel = Kernel(model)
-            poses = kernel.poses(q)
-            here, there = poses.subset(inside), poses.subset(~inside)
-            if choice is None:
-                robot = fit_nominal(model, here, [train])
-            else:
-                # Harmonics are weakly told from geometry where the joints move little: a prior keeps them small at
-                # poses outside. It needs covariances of the size of the real misfit: those of the fit before.
-                wave = {n: WAVE_PRIOR for t in model.terms for n in t.parameter_names}
-                scale = robot.sigma0 if wave else 1.0
-                train = FrameObservations(train.pose, train.world_T_tool, train.covariance * scale**2)
-                robot = identify(model, here, [train], IdentifyOptions(parameters=choice, priors=wave), kernel)
-            row.append(1e3 * verify(robot, there, [test]).tools["0"].rms)
-            elastic = elastic if model is wavy else sum("elastic" in n for n in robot.names)
-        rows.append([*row, elastic])
+        inputs = Kernel(plain).poses(q)
+        here, there = inputs.subset(inside), inputs.subset(~inside)
+        robots = [fit_nominal(plain, here, [train])]
+        robots += [identify(plain, here, [train], IdentifyOptions(parameters=p)) for p in ("geometry", "standard")]
+        found = robots[-1]
+        waves = waves_by_evidence(found, here, train)
+        # Harmonics are weakly told from geometry where the joints move little: a prior keeps them small at poses
+        # outside. It needs covariances of the size of the real misfit: those of the fit before.
+        scaled = FrameObservations(train.pose, train.world_T_tool, train.covariance * found.sigma0**2)
+        for chosen in (low, waves):
+            model = harmonics(plain, chosen)
+            priors = {n: WAVE_PRIOR for t in model.terms for n in t.parameter_names}
+            robots.append(identify(model, here, [scaled], IdentifyOptions(priors=priors)))
+        row += [1e3 * verify(robot, there, [test]).tools["0"].rms for robot in robots]
+        elastic = sum("elastic" in n for n in found.names)
+        rows.append([*row, elastic, len(waves)])
+        orders.append(f"  {series.upper()}: " + "; ".join(
+            f"axis {k}: {', '.join(str(m) for j, m in waves if j == k)}" for k in range(1, 7)))
     table(
         "UR10 and laser tracker: RMS of the position error at kept-out poses, mm",
-        ["series", "identify", "verify", "nominal", "geometry", "+ elasticity", "+ harmonics 1-4", "elastic"],
+        ["series", "identify", "verify", "nominal", "geometry", "+ elasticity", "+ harmonics 1-4",
+         "or by evidence", "elastic", "waves"],
         rows,
     )
+    print("  orders chosen by evidence\n" + "\n".join(orders))
 
 
 if __name__ == "__main__":

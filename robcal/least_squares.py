@@ -66,12 +66,17 @@ class SolveSummary:
     seconds: float = 0.0
 
 
-def solve_step(r: Array, J: Array) -> Array:
-    """Least-squares step (p,) by scaled normal equations; by the pseudo-inverse where they are singular."""
+def solve_step(r: Array, J: Array, usual: Array | None = None) -> Array:
+    """Least-squares step (p,) by scaled normal equations; by the pseudo-inverse where they are singular.
+
+    ``usual`` (p,): sizes that steps have; a step in units of these counts like a measured residual.
+    """
     scale = np.linalg.norm(J, axis=0)
     scale[scale == 0] = 1.0
     scaled = J / scale
     N, b = scaled.T @ scaled, scaled.T @ r
+    if usual is not None:
+        N[np.diag_indices_from(N)] += 1.0 / (usual * scale) ** 2
     try:
         factor = linalg.cho_factor(N, check_finite=False)
         step = linalg.cho_solve(factor, b, check_finite=False)
@@ -86,6 +91,7 @@ def gauss_newton(
     retract: Callable[[State, Array], State],
     start: State,
     settings: TerminationSettings = TerminationSettings(),
+    usual: Array | None = None,
 ) -> tuple[State, SolveSummary]:
     """Minimise ``|r|^2`` by Gauss-Newton steps, halved until the cost falls (thesis section 5.2).
 
@@ -96,6 +102,8 @@ def gauss_newton(
     retract : moves a state by a step (p,).
     start : first state.
     settings : termination.
+    usual : (p,) sizes that steps have, or None. Where the data leave a direction nearly open (almost parallel axes), a
+        full step would follow it beyond all linearity; one damped by these sizes does not (Levenberg 1944).
 
     Raises
     ------
@@ -114,7 +122,7 @@ def gauss_newton(
         return SolveSummary(converged, len(history) - 1, why, history[0], cost, tuple(history), halvings, seconds)
 
     for _ in range(settings.max_iterations):
-        step = solve_step(r, J)
+        step = solve_step(r, J, usual)
         predicted = J @ step
         promise = float(r @ predicted - 0.5 * predicted @ predicted)
         small = settings.cost_tolerance * (1.0 + cost)

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
+from scipy import linalg, special
 
 from robcal.calibration.identifiability import Candidates, check_poses, choose_by_evidence, limit_rules, limits_at
 from robcal.calibration.problem import Evaluator, Problem, State, whitening
@@ -22,8 +22,12 @@ Array = NDArray[np.float64]
 
 LATE_SHARE = 0.2
 """Share of the plausible sigma below which a parameter may enter that was dependent at the start values."""
-MISFIT = 1.5
-"""Sum of squares over that of all candidates together above which the elimination was too strict."""
+CONCEIVABLE = 5.0
+"""Deviations that robots may have, as a standard deviation in units of the plausible ones."""
+USUAL_STEP = 2.5
+"""Steps of the iteration that are common, in units of the plausible deviations."""
+MISFIT_LEVEL = 1e-4
+"""p-value, of what all candidates together would take off the sum of squares, below which too much was eliminated."""
 
 
 @dataclass(frozen=True)
@@ -96,18 +100,21 @@ class Engine:
         for round_ in range(4):
             problem = self.problem(state, kept, weights)
             state, summary = gauss_newton(
-                problem.linearise, problem.residuals, problem.retract, state, self.termination
+                problem.linearise, problem.residuals, problem.retract, state, self.termination,
+                USUAL_STEP * self._plausible(state, kept),
             )
             iterations += summary.iterations
             first = summary if first is None else first
-            self.scatter = self._scatter(state, names, weights)
+            self.scatter, least, free = self._with_all(state, names, weights)
             # What looks weak where it is linearised may matter further on: no look may make the fit worse than the
             # parameters that it saves are worth (Bayesian information criterion).
             worth = self._worth(summary.cost, len(kept), rows)
             worse = best is not None and worth > best[0]
             if best is None or not worse:
                 best = (worth, Solution(problem, state, tuple(kept), eliminated, {}, first, summary, iterations))
-            strict = 2.0 * best[1].summary.cost / self.scatter**2 > MISFIT * rows
+            gain = (2.0 * best[1].summary.cost - least) / self.scatter**2
+            left_out = max(1.0, free - len(best[1].names))
+            strict = special.chdtrc(left_out, max(0.0, gain)) < MISFIT_LEVEL
             if round_ == 3 or (worse and not strict):
                 break
             if strict and round_ > 0:  # something that matters was left out as weak: look again with more patience
@@ -176,20 +183,24 @@ class Engine:
         """Bayesian information criterion, in units of the data's own scatter; the smaller the better."""
         return 2.0 * cost / self.scatter**2 + parameters * float(np.log(max(2, rows)))
 
-    def _scatter(self, state: State, names: Sequence[str], weights: Array) -> float:
-        """How far the stated covariance can be trusted: sigma0 of the data with all candidates free, one at least.
+    def _with_all(self, state: State, names: Sequence[str], weights: Array) -> tuple[float, float, float]:
+        """What a fit with all candidates would leave: sigma0 (one at least), sum of squares, parameters used.
 
-        With all candidates, also the dependent ones (pseudo-inverse), or a parameter left out too early would make the
-        data look so bad that it could not come back.
+        With all candidates, also the dependent ones, or a parameter left out too early would make the data look so bad
+        that it could not come back. Only by deviations that robots have, though: what is missing in the model can
+        always be imitated by enormous ones that nearly cancel. The first says how far the stated covariance can be
+        trusted.
         """
         normals = self.normals(state, names, weights)
-        scale = np.sqrt(np.diag(normals.N))
-        scale[scale == 0] = 1.0
-        factor, order, rank, _ = linalg.lapack.dpstrf(normals.N / np.outer(scale, scale), tol=1e-10, lower=1)
-        free = order[:rank] - 1
-        along = linalg.blas.dtrsv(factor[:rank, :rank], (normals.b / scale)[free], lower=1)
-        left = normals.square - float(along @ along)
-        return max(1.0, float(np.sqrt(max(0.0, left) / max(1, self._rows(weights) - rank))))
+        size = CONCEIVABLE * self._plausible(state, names)
+        wide = ~np.isfinite(size)
+        size[wide] = 1.0 / np.sqrt(np.maximum(np.diag(normals.N)[wide], 1e-300))
+        scaled = normals.N * np.outer(size, size)
+        factor = linalg.cho_factor(scaled + np.diag(np.where(wide, 1e-10, 1.0)), lower=True, check_finite=False)
+        b = normals.b * size
+        left = max(0.0, normals.square - float(b @ linalg.cho_solve(factor, b, check_finite=False)))
+        used = float(np.trace(linalg.cho_solve(factor, scaled, check_finite=False)))
+        return max(1.0, float(np.sqrt(left / max(1.0, self._rows(weights) - used)))), left, used
 
     def _rows(self, weights: Array) -> int:
         """Measured numbers of the poses that are not left out."""
@@ -212,10 +223,12 @@ class Engine:
                 square += (value / sigma) ** 2
         return Normals(N, b, square)
 
-    def _limits(self, state: State, names: Sequence[str]) -> Array:
+    def _plausible(self, state: State, names: Sequence[str]) -> Array:
         at = [self._at[n] for n in names]
-        limits = limits_at(self._rules[0][at], self._rules[1][at], self.evaluator(state).moments)
-        return limits * (self.slack / self.scatter)
+        return limits_at(self._rules[0][at], self._rules[1][at], self.evaluator(state).moments)
+
+    def _limits(self, state: State, names: Sequence[str]) -> Array:
+        return self._plausible(state, names) * (self.slack / self.scatter)
 
     def _eliminate(
         self, state: State, names: Sequence[str], weights: Array, before: Mapping[str, Eliminated] | None = None

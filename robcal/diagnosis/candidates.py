@@ -90,5 +90,5 @@ def entries(families: Sequence[Family], at: Tangents) -> list[Entry]:
         for g, constants in enumerate(family.grid):
             columns = at.columns(family, constants) * family.sizes(constants)
             if np.all(np.isfinite(columns)):
-                out.append(Entry(i, g, columns))
+                out.append(Entry(i, g, columns, family.positive))
     return out

@@ -3,7 +3,7 @@
 All quantities are whitened. With `Q` an orthonormal basis of the fitted Jacobian, a candidate with columns `C` (scaled
 by the prior amplitudes) is seen through `C - Q Q' C = U S V'`; its test statistic is `|U' r|^2` (an F test with the
 estimated variance factor), its evidence against "nothing is missing" is the Bayes factor of a linear Gaussian model
-whose amplitudes have the prior as standard deviation, averaged over three sizes of prior. Source: Kass and Raftery
+whose amplitudes have the prior as standard deviation, averaged over four sizes of prior. Source: Kass and Raftery
 (1995) for Bayes factors; Baarda (1968), Teunissen (2006) for detection, identification, adaptation.
 """
 
@@ -13,11 +13,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+from scipy import special, stats
 
 from robcal.physics.family import Array
 
-PRIOR_SCALES = (0.3, 1.0, 3.0)
+PRIOR_SCALES = (0.3, 1.0, 3.0, 10.0)
 """Sizes of the prior amplitude over which the evidence is averaged."""
 LEAST_SIGNAL = 0.05
 """Directions whose signal stays below this many sigma at the typical amplitude cannot be seen and are left out."""
@@ -25,11 +25,13 @@ LEAST_SIGNAL = 0.05
 
 @dataclass(frozen=True)
 class Entry:
-    """One candidate with fixed constants: index of its family, of its grid point, and its whitened columns (m, c)."""
+    """One candidate with fixed constants: index of its family, of its grid point, its whitened columns (m, c), and, for
+    a single column, the prior probability that its amplitude is positive."""
 
     family: int
     grid: int
     columns: Array
+    positive: float = 0.5
 
 
 @dataclass(frozen=True)
@@ -43,6 +45,7 @@ class Stack:
     singular : (e, c) projected signal per prior amplitude, in sigma.
     right : (e, c, c) V'.
     count : (e,) directions that can be seen.
+    positive : (e,) prior probability of a positive amplitude.
     """
 
     family: Array
@@ -51,6 +54,7 @@ class Stack:
     singular: Array
     right: Array
     count: Array
+    positive: Array
 
 
 @dataclass(frozen=True)
@@ -135,17 +139,26 @@ def stack_entries(entries: Sequence[Entry], fitted: Fitted) -> tuple[Stack, ...]
                 singular * seen,
                 right,
                 seen.sum(axis=1),
+                np.array([entry.positive for entry in group]),
             )
         )
     return tuple(stacks)
 
 
-def log_bayes_factor(singular: Array, z: Array) -> Array:
-    """Evidence of entries (e,) from singular values (e, c) in sigma per prior amplitude and scores z (e, c)."""
+def log_bayes_factor(singular: Array, z: Array, positive: Array | None = None) -> Array:
+    """Evidence of entries (e,) from singular values (e, c) in sigma per prior amplitude and scores z (e, c).
+
+    With one column, ``positive`` (e,) is the prior probability of a positive amplitude: the normal prior's two halves
+    then have unequal weights.
+    """
     parts = []
     for scale in PRIOR_SCALES:
         gain = (scale * singular) ** 2
-        parts.append(np.sum(0.5 * z**2 * gain / (1.0 + gain) - 0.5 * np.log1p(gain), axis=1))
+        part = np.sum(0.5 * z**2 * gain / (1.0 + gain) - 0.5 * np.log1p(gain), axis=1)
+        if positive is not None and z.shape[1] == 1:
+            chance = special.ndtr((z * np.sqrt(gain / (1.0 + gain)))[:, 0])
+            part = part + np.log(2.0 * (positive * chance + (1.0 - positive) * (1.0 - chance)))
+        parts.append(part)
     return np.asarray(np.logaddexp.reduce(parts, axis=0) - np.log(len(PRIOR_SCALES)))
 
 
@@ -165,7 +178,10 @@ def scan(stacks: Sequence[Stack], residual: Array, redundancy: int) -> ScanResul
     variance = (total - raw[best]) / max(redundancy - count[best], 1)
     sigma = np.sqrt(max(variance, 1e-300))
     evidence = np.concatenate(
-        [log_bayes_factor(stack.singular / sigma, z / sigma) for stack, z in zip(stacks, scores, strict=True)]
+        [
+            log_bayes_factor(stack.singular / sigma, z / sigma, stack.positive)
+            for stack, z in zip(stacks, scores, strict=True)
+        ]
     )
     evidence[count == 0] = -np.inf
     return ScanResult(family, grid, count, raw / variance, log_p, evidence, float(variance), redundancy)

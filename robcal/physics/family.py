@@ -70,6 +70,8 @@ class Family:
     grid : values of the constants to be tried.
     continuous : constants that may be refined, with their bounds.
     ordered : constants with a long list of values of which the grid holds a part; refined among the values nearby.
+    positive : prior probability that the amplitude is positive (one parameter only): things give way and grow, rarely
+        the reverse.
     weight : prior weight of the whole family (a cause that may act at many places shares one weight among them).
     bases : robot families: constants to the expressions.
     frees : robot families: parameters the kernel has already, which the cause sets free (order of `parameters`).
@@ -87,6 +89,7 @@ class Family:
     grid: tuple[Constants, ...] = ({},)
     continuous: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     ordered: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    positive: float = 0.5
     weight: float = 1.0
     bases: Callable[[Constants], tuple[Basis, ...]] | None = None
     frees: tuple[str, ...] = ()

@@ -41,6 +41,7 @@ def _stiffness(site: RobotSite, joint: Joint) -> Iterator[Family]:
     if joint.prismatic or not site.varies(f"torque{k}", 1.0):
         return
     elastic = f"{joint.frame}.elastic_{joint.own_angle}"
+    torque = f"torque{k}"
     linear_fitted = elastic in site.fitted
     if not linear_fitted:
         yield Family(
@@ -49,13 +50,13 @@ def _stiffness(site: RobotSite, joint: Joint) -> Iterator[Family]:
             joint.where,
             LETTER_OF_KIND[joint.own_angle],
             (elastic,),
-            (3e-6,),
+            (site.compliance(torque, 3e-6),),
             lambda v, c: {"compliance_deg_per_kNm": float(v[0]) * PER_KNM},
             "{where} gives way about its own axis by {compliance_deg_per_kNm:.3g} deg/kNm, which the model leaves out",
+            positive=0.98,
             frees=(elastic,),
         )
     held = float(site.model.parameters.get(elastic, 0.0))
-    torque = f"torque{k}"
     largest = float(np.max(np.abs(site.variables[torque])))
     cubic = Basis(joint.frame, "q", f"{torque}*{torque}*{torque}", "cubic")
     linear = Basis(joint.frame, "q", torque, "linear")
@@ -116,6 +117,7 @@ def _backlash(site: RobotSite, joint: Joint) -> Iterator[Family]:
         "{where} has {" + name + ":.4f} " + joint.unit + " of backlash the model does not know",
         grid=grid,
         ordered={"threshold_Nm": every} if every else {},
+        positive=0.97,
         bases=bases,
         covariates=(f"approach{k}", f"torque{k}"),
     )
@@ -145,6 +147,7 @@ def _hysteresis(site: RobotSite, joint: Joint) -> Iterator[Family]:
         (_lag(joint),),
         lambda v, c: {name: float(v[0]) * joint.factor},
         "{where} lags behind by {" + name + ":.4f} " + joint.unit + " between the two approach directions",
+        positive=0.97,
         bases=lambda c: (Basis(joint.frame, "q", f"-0.5*approach{k}", "width"),),
         covariates=(f"approach{k}",),
     )
@@ -168,6 +171,7 @@ def _lost_motion(site: RobotSite, joint: Joint) -> Iterator[Family]:
         "{where} loses {amplitude_deg:.4f} deg around zero load (lost motion, scale {torque_Nm:.0f} N m)",
         grid=tuple({"torque_Nm": s} for s in scales),
         continuous={"torque_Nm": (0.003 * largest, 2.0 * largest)},
+        positive=0.7,
         bases=lambda c: (Basis(joint.frame, "q", f"tanh(torque{k}/torque_Nm)", "amplitude", c),),
         covariates=(f"torque{k}",),
     )

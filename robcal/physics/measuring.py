@@ -303,6 +303,7 @@ def _wire() -> Iterator[Family]:
     yield replace(
         family("wire_sag", 1e-6, "g_per_m", 1.0, "The wire sags as one of {g_per_m:.1f} g/m does", sag),
         report=lambda v, c: {"g_per_m": float(np.sqrt(max(v[0], 0.0))) * 1e3},
+        positive=0.99,
     )
     yield family(
         "wire_stretch",
@@ -316,7 +317,7 @@ def _wire() -> Iterator[Family]:
     yield family(
         "wire_offset", 1e-3, "mm", 1e3, "The wire's zero is off by {mm:.2f} mm", lambda d: np.ones(len(d.pose))
     )
-    yield family(
+    wrap = family(
         "pulley_wrap",
         5e-3,
         "radius_mm",
@@ -325,6 +326,7 @@ def _wire() -> Iterator[Family]:
         # over the top of the pulley: the higher the wire leaves, the less of it is wrapped
         lambda d: -np.arctan2(d.p_world[:, 2], np.hypot(d.p_world[:, 0], d.p_world[:, 1])),
     )
+    yield replace(wrap, positive=0.99)
 
 
 def _sensor(data: ObservationData, body: str) -> Iterator[Family]:

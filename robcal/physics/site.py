@@ -10,6 +10,8 @@ import numpy as np
 from robcal.physics.family import DEG, Array
 from robcal.robot.model import RobotModel
 
+TYPICAL_DEFLECTION = 2e-4
+"""rad under the largest load of a recording."""
 ANGLE_OF_AXIS = {"x": "roll", "y": "pitch", "z": "yaw"}
 LETTER_OF_KIND = {"roll": "x", "pitch": "y", "yaw": "z", "x": "x", "y": "y", "z": "z"}
 
@@ -88,6 +90,12 @@ class RobotSite:
     def temperatures(self) -> tuple[str, ...]:
         """Recorded temperatures that change by more than 0.2 K, enough to speak of."""
         return tuple(v for v in self.variables if v.startswith("temp_") and self.varies(v, 0.2))
+
+    def compliance(self, moment: str, least: float) -> float:
+        """Typical compliance (rad/(N m)) for a moment that was recorded: `least`, or more where loads are small, since
+        small robots are softer in proportion."""
+        largest = float(np.max(np.abs(self.variables.get(moment, np.zeros(1)))))
+        return max(least, TYPICAL_DEFLECTION / max(largest, 1.0))
 
     def duration_h(self) -> float:
         """Hours between the first and the last pose; zero without times."""

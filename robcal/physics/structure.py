@@ -34,9 +34,10 @@ def _link_compliance(site: RobotSite, joint: Joint) -> Iterator[Family]:
             joint.where,
             LETTER_OF_KIND[angle],
             (name,),
-            (1e-6,),
+            (site.compliance(f"{identifier(joint.frame)}_m{angle}", 1e-6),),
             lambda v, c: {"compliance_deg_per_kNm": float(v[0]) * PER_KNM},
             "The link or bearing of {where} gives way about {direction} by {compliance_deg_per_kNm:.3g} deg/kNm",
+            positive=0.95,
             frees=(name,),
             covariates=(f"{identifier(joint.frame)}_m{angle}",),
         )
@@ -164,9 +165,10 @@ def _base(site: RobotSite) -> Iterator[Family]:
             "base",
             None,
             ("compliance",),
-            (3e-7,),
+            (min(site.compliance(f"base_m{axis}", 3e-7) for axis in "xy"),),
             lambda v, c: {"compliance_deg_per_kNm": float(v[0]) * PER_KNM},
             "The foundation tilts under the overturning moment by {compliance_deg_per_kNm:.3g} deg/kNm",
+            positive=0.98,
             bases=lambda c: (
                 Basis("base", "roll", "base_mx", "compliance"),
                 Basis("base", "pitch", "base_my", "compliance"),

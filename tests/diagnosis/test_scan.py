@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -73,3 +74,16 @@ def test_gross_error_is_found_in_its_group() -> None:
     suspect = worst_group(r, basis, np.repeat(np.arange(ROWS // 3), 3))
     assert suspect.label == 10
     assert suspect.log_evidence > 20
+
+
+def test_a_preferred_sign_shares_out_the_same_evidence() -> None:
+    singular, z = np.full((2, 1), 5.0), np.array([[4.0], [-4.0]])
+    plain = log_bayes_factor(singular, z)
+    preferred = log_bayes_factor(singular, z, np.full(2, 0.9))
+    assert plain[0] == pytest.approx(plain[1])
+    assert preferred[0] - plain[0] == pytest.approx(np.log(1.8), abs=0.01)
+    assert preferred[1] - plain[1] == pytest.approx(np.log(0.2), abs=0.05)
+    # the two signs' evidences add up to what they are without a preference
+    mirrored = log_bayes_factor(singular, z[::-1], np.full(2, 0.9))
+    assert np.logaddexp(preferred, mirrored) == pytest.approx(plain + np.log(2.0))
+    assert log_bayes_factor(singular, z, np.full(2, 0.5)) == pytest.approx(plain)
