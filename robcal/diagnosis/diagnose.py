@@ -32,6 +32,8 @@ from robcal.robot.terms import identifier
 DEFAULTS = SelectionSettings()
 PLAUSIBLE_DEFLECTION = 3e-4
 """rad under the largest load, for elasticities."""
+MOST_BESIDE_CURVES = 4
+"""Causes that are looked for beside irregular curves of the joints: what these leave is small."""
 MOST_POSES = 200
 """Poses on which a search is done; the final fit takes all."""
 
@@ -66,21 +68,25 @@ def diagnose(
     thin = thinned(recording)
     noise = estimate_noise(model, thin, free)
     curves, of_curves = _curves(model, recording, free, verify, tell)
-    # while other causes are looked for, the curves stand as numbers: they follow from far more poses than a search has
-    curved = model.with_terms(curves.frozen)
-    if curves.accepted:
-        noise = estimate_noise(curved, thin, free)
     silent = frozenset(optional) & set(free)
-    chosen = select(curved, noise.apply(thin), free, tied, settings, tell)
-    bare_model, bare = curved, free
-    if chosen.accepted and silent:
-        bare_model = curved.with_parameters(dict.fromkeys(silent, 0.0))
-        bare = tuple(name for name in free if name not in silent)
-        again = select(bare_model, noise.apply(thin), bare, tied, settings, tell)
-        if _information(again) < _information(chosen):
+    bare_model = model.with_parameters(dict.fromkeys(silent, 0.0)) if silent else model
+    bare = tuple(name for name in free if name not in silent)
+    if curves.accepted:
+        # While other causes are looked for, the curves stand as numbers: they follow from far more poses than a search
+        # has. They are an effect that was left out, so the search without the optional parameters is the one to do.
+        bare_model = bare_model.with_terms(curves.frozen)
+        noise = estimate_noise(bare_model, thin, bare)
+        settings = replace(settings, most=min(settings.most, MOST_BESIDE_CURVES))
+        chosen = select(bare_model, noise.apply(thin), bare, tied, settings, tell)
+    else:
+        chosen = select(model, noise.apply(thin), free, tied, settings, tell)
+        again = None
+        if chosen.accepted and silent:
+            again = select(bare_model, noise.apply(thin), bare, tied, settings, tell)
+        if again is not None and _information(again) < _information(chosen):
             chosen = again
         else:
-            bare_model, bare = curved, free
+            bare_model, bare = model, free
     if chosen.accepted:
         # the first estimate contained the effects
         noise = estimate_noise(bare_model, chosen.recording, bare, chosen.accepted)
