@@ -8,7 +8,7 @@ true. A curve that a few waves describe as well is left to the causes with a nam
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -31,6 +31,8 @@ ROWS_A_BUMP = 4.0
 """Measured numbers that are needed for each bump."""
 GAIN = 0.7
 """Share of the square sum at kept-out poses below which the curves must come."""
+LEAST_GAIN = 0.03
+"""Share of that square sum by which the kept-out poses must miss the curve of a joint for it to count."""
 WAVES = 2
 HIGHEST_WAVE = 60.0
 IRREGULAR = 0.35
@@ -96,30 +98,35 @@ def find_curves(present: Fit, recording: Recording) -> Curves:
     site = RobotSite(present.model, at.variables, frozenset(present.free), frozenset())
     joints = [j for j in site.joints if not j.prismatic and site.varies(f"q{j.number}", 0.5)]
     label = folds(recording)[present.row_pose]
-    best: tuple[float, float, list[Family], list[Array]] | None = None
+    best: tuple[float, _Folded, list[Family], list[Array]] | None = None
     for count in BUMPS_A_TURN:
         families = [periodic_curve(j, site.variables[f"q{j.number}"], count) for j in joints]
         columns = [at.columns(f, f.grid[0]) * f.sizes(f.grid[0]) for f in families]
         if ROWS_A_BUMP * sum(c.shape[1] for c in columns) > len(present.residual):
             break
-        before, after = _kept_out(present, columns, label)
-        if best is None or after < best[1]:
-            best = before, after, families, columns
-    if best is None or best[1] > GAIN * best[0]:
+        folded = _folded(present, columns, label)
+        after = folded.kept_out(range(len(columns)))
+        if best is None or after < best[0]:
+            best = after, folded, families, columns
+    if best is None:
         return Curves()
-    _, _, families, columns = best
-    values = _solve(present, columns)
-    left = [
-        _irregularity(f, v * f.sizes(f.grid[0]), site.variables[f"q{j.number}"])
-        for j, f, v in zip(joints, families, values, strict=True)
-    ]
-    irregular = [k for k, share in enumerate(left) if share > IRREGULAR]
-    # where it is the make of the joints, all have it, also those whose few angles do not show how irregular it is
-    keep = irregular if len(irregular) < SEVERAL else list(range(len(left)))
-    if not keep:
-        return Curves()
-    before, after = _kept_out(present, [columns[k] for k in keep], label)
+    after, folded, families, columns = best
+    before = folded.kept_out(())
     if after > GAIN * before:
+        return Curves()
+    everyone = range(len(columns))
+    matters = [folded.kept_out([j for j in everyone if j != k]) - after > LEAST_GAIN * before for k in everyone]
+    values = _solve(present, columns)
+    irregular = [
+        k for k in everyone
+        if matters[k]
+        and _irregularity(
+            families[k], values[k] * families[k].sizes(families[k].grid[0]), site.variables[f"q{joints[k].number}"]
+        ) > IRREGULAR
+    ]  # fmt: skip
+    # where it is the make of the joints, all have it, also those whose few angles do not show how irregular it is
+    keep = irregular if len(irregular) < SEVERAL else list(everyone)
+    if not keep or folded.kept_out(keep) > GAIN * before:
         return Curves()
     chosen = [columns[k] for k in keep]
     values = _solve(present, chosen)
@@ -231,23 +238,38 @@ def _scaled(present: Fit) -> Array:
     return present.jacobian / np.where(size > 0, size, 1.0)
 
 
-def _kept_out(present: Fit, columns: Sequence[Array], label: Array) -> tuple[float, float]:
-    """Square sums of the residuals predicted from the other folds, without and with the columns."""
+@dataclass(frozen=True)
+class _Folded:
+    """Normal equations of each fold, and in them the places of the fitted parameters and of each joint's columns."""
+
+    folds: tuple[tuple[Array, Array, float], ...]
+    ends: Array
+    variance: float
+
+    def kept_out(self, joints: Iterable[int]) -> float:
+        """Square sum of the residuals that the other folds predict with the curves of the given joints."""
+        fitted = int(self.ends[0])
+        at = np.concatenate([np.arange(fitted), *(np.arange(self.ends[k], self.ends[k + 1]) for k in joints)])
+        gram = np.sum([f[0] for f in self.folds], axis=0)[np.ix_(at, at)]
+        right = np.sum([f[1] for f in self.folds], axis=0)[at]
+        total = 0.0
+        for N, b, square in self.folds:
+            here, own = N[np.ix_(at, at)], b[at]
+            x = _Normals(gram - here, right - own, fitted).solve(self.variance)
+            total += square - 2.0 * float(x @ own) + float(x @ here @ x)
+        return total
+
+
+def _folded(present: Fit, columns: Sequence[Array], label: Array) -> _Folded:
     fitted = _scaled(present)
-    X = np.column_stack([fitted, *columns])
-    r = present.residual
-    p = fitted.shape[1]
-    gram, right = X.T @ X, X.T @ r
-    variance = _variance(present, X, gram, right, p)
-    sums = [0.0, 0.0]
+    X, r = np.column_stack([fitted, *columns]), present.residual
+    folds = []
     for fold in np.unique(label):
-        test = label == fold
-        A, b = X[test], r[test]
-        left = gram - A.T @ A, right - A.T @ b
-        for k, width in enumerate((p, X.shape[1])):
-            x = _Normals(left[0][:width, :width], left[1][:width], p).solve(variance)
-            sums[k] += float(np.sum((b - A[:, :width] @ x) ** 2))
-    return sums[0], sums[1]
+        A, b = X[label == fold], r[label == fold]
+        folds.append((A.T @ A, A.T @ b, float(b @ b)))
+    ends = np.cumsum([fitted.shape[1], *(c.shape[1] for c in columns)])
+    gram, right = np.sum([f[0] for f in folds], axis=0), np.sum([f[1] for f in folds], axis=0)
+    return _Folded(tuple(folds), ends, _variance(present, X, gram, right, fitted.shape[1]))
 
 
 def _variance(present: Fit, X: Array, gram: Array, right: Array, fitted: int) -> float:
