@@ -177,6 +177,10 @@ def compensate(
     system: Annotated[
         str, typer.Option("--in", metavar="world|base", help="Coordinates of the frames: measuring system or base.")
     ] = "world",
+    program: Annotated[
+        str | None,
+        typer.Option("--program", metavar="krl|rapid|urscript", help="Write a program of that controller, no table."),
+    ] = None,
     skip: Annotated[
         bool, typer.Option("--skip-unreachable", help="Leave out frames that the robot cannot reach.")
     ] = False,
@@ -188,12 +192,16 @@ def compensate(
         _wrong_use(f"--as is 'joints' or 'frames', not '{kind}'")
     if system not in ("world", "base"):
         _wrong_use(f"--in is 'world' or 'base', not '{system}'")
+    if program not in (None, "krl", "rapid", "urscript"):
+        _wrong_use(f"--program is 'krl', 'rapid' or 'urscript', not '{program}'")
     with _answers("compensate", as_json) as answer:
         from pipeline.prediction import compensate_run
 
         targets, in_base = kind == "frames", system == "base"
         answer.update(
-            compensate_run(run_folder, frames, out, as_frames=targets, in_base=in_base, skip_unreachable=skip)
+            compensate_run(
+                run_folder, frames, out, as_frames=targets, in_base=in_base, skip_unreachable=skip, program=program
+            )
         )
         messages = Messages(quiet)
         for sentence in answer["warnings"]:

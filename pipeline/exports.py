@@ -21,7 +21,7 @@ def export_run(folder: Path, c: Path | None, urdf: Path | None) -> list[Path]:
     calibrated = load_calibrated(open_run(folder))
     written: list[Path] = []
     if c is not None:
-        source = export_c(calibrated.model, statics=calibrated.statics)
+        source = export_c(calibrated.model, statics=calibrated.statics, defaults=calibrated.defaults)
         for name, text in ((source.header_name, source.header), (source.source_name, source.source)):
             write_text(c / name, text)
             written.append(c / name)

@@ -36,6 +36,7 @@ class Poses:
     approach : (n, joints) -1, 0, +1; inferred : true where it was taken from the order of the poses.
     covariates : further numeric columns by name (``time_s``, ``temp_<place>_c``, any other), as in the file.
     notes : what was assumed or ignored, in words.
+    outside : the first pose beyond the robot's ranges, in words; empty if all are within.
     """
 
     path: Path
@@ -48,6 +49,7 @@ class Poses:
     approach_inferred: bool = False
     covariates: Mapping[str, Array] = field(default_factory=dict, repr=False)
     notes: tuple[str, ...] = ()
+    outside: str = ""
 
     def __len__(self) -> int:
         return len(self.names)
@@ -84,7 +86,8 @@ def read_poses(
 
     Raises
     ------
-    InvalidInput : the table contradicts the contract or the robot (columns, limits, payloads).
+    InvalidInput : the table contradicts the contract or the robot (columns, payloads). Poses beyond the limits are only
+        told (``outside``), since exchanged columns or wrong signs lead there as well.
     """
     table = read_table(path)
     table.require(["pose"])
@@ -98,8 +101,6 @@ def read_poses(
     joints = joint_columns(robot)
     _check_joint_columns(table, [name for name, _ in joints])
     q = np.column_stack([table.numbers(name) * factor for name, factor in joints])
-    if not to_predict:
-        _check_limits(table, robot, q)
     notes: list[str] = []
     approach, inferred = _approach(table, q, to_predict, notes)
     known = {"pose", "payload", "set", *(name for name, _ in joints)}
@@ -115,6 +116,7 @@ def read_poses(
         approach_inferred=inferred,
         covariates=_covariates(table, known, notes),
         notes=tuple(notes),
+        outside="" if to_predict else _outside(table, robot, q),
     )
 
 
@@ -138,7 +140,7 @@ def _check_joint_columns(table: Table, wanted: list[str]) -> None:
         )
 
 
-def _check_limits(table: Table, robot: RobotModel, q: Array) -> None:
+def _outside(table: Table, robot: RobotModel, q: Array) -> str:
     for k, (joint, (column, factor)) in enumerate(zip(robot.joints, joint_columns(robot), strict=True)):
         if joint.limits is None:
             continue
@@ -147,12 +149,13 @@ def _check_limits(table: Table, robot: RobotModel, q: Array) -> None:
         if outside.any():
             i = int(np.argmax(outside))
             unit = "mm" if joint.prismatic else "deg"
-            raise table.error(
+            return str(table.error(
                 i,
                 f"{column} = {q[i, k] / factor:g} {unit} lies outside the range {low / factor:g} to {high / factor:g} "
                 f"{unit} of {joint.name} ({int(outside.sum())} such poses): correct the angle, or the range in the "
                 "robot file",
-            )
+            ))
+    return ""
 
 
 def parse_payload(table: Table, payloads: Collection[str]) -> tuple[str | None, ...]:

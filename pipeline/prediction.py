@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,13 +11,16 @@ from typing import Any
 import numpy as np
 
 from pipeline.calibrated import Calibrated, load_calibrated, predicted
+from pipeline.files import write_text
 from pipeline.frame_tables import SIX, frame_columns, sigma_columns
 from pipeline.poses_table import joint_columns, parse_payload, read_poses
 from pipeline.runs import open_run
 from pipeline.tables import read_table, write_table
 from robcal.errors import InvalidInput
 from robcal.robot.compensation import cell_frames, compensate
+from robcal.robot.controller_formats import frame_program, joint_program
 from robcal.robot.kernel import Kernel
+from robcal.robot.model import RobotModel
 from robcal.transforms import Array, difference, frame_from_xyzrpy
 
 
@@ -75,8 +79,9 @@ def compensate_run(
     as_frames: bool = False,
     in_base: bool = False,
     skip_unreachable: bool = False,
+    program: str | None = None,
 ) -> dict[str, Any]:
-    """Write the commands that bring the real tool to the wanted frames.
+    """Write the commands that bring the real tool to the wanted frames: a table, or a ``program`` of a controller.
 
     Raises
     ------
@@ -108,13 +113,16 @@ def compensate_run(
     warnings = [f"{frames}: frame '{wanted.names[i]}' left out: {result.reason[i]}" for i in unreachable]
     missed = [wanted.names[i] for i in rows if not result.converged[i]]
     warnings += [f"{frames}: frame '{name}' is met only approximately (near a singular pose?)" for name in missed]
-    columns: dict[str, Sequence[object]] = {"pose": [wanted.names[i] for i in rows]}
-    if as_frames:
-        columns.update(frame_columns(result.F_star[rows]))
+    if program is not None:
+        write_text(out, _program(model, result.F_star[rows] if as_frames else result.q[rows], program, as_frames, out))
     else:
-        for k, (name, factor) in enumerate(joint_columns(model)):
-            columns[name] = [f"{v:.9f}" for v in result.q[rows, k] / factor]
-    write_table(out, columns)
+        columns: dict[str, Sequence[object]] = {"pose": [wanted.names[i] for i in rows]}
+        if as_frames:
+            columns.update(frame_columns(result.F_star[rows]))
+        else:
+            for k, (name, factor) in enumerate(joint_columns(model)):
+                columns[name] = [f"{v:.9f}" for v in result.q[rows, k] / factor]
+        write_table(out, columns)
     remaining = np.linalg.norm(result.remaining[rows, :3], axis=1) * 1000
     before = np.linalg.norm(result.before[rows, :3], axis=1) * 1000
     return {
@@ -125,6 +133,13 @@ def compensate_run(
         "uncompensated_mean_mm": float(np.nanmean(before)),
         "warnings": warnings,
     }
+
+
+def _program(model: RobotModel, values: Array, dialect: str, as_frames: bool, out: Path) -> str:
+    """Text of a controller's program, named after its file."""
+    word = re.sub(r"\W", "_", out.stem)[:24]
+    name = word if re.match(r"[A-Za-z]", word) else f"robcal_{word}"[:24]
+    return frame_program(values, dialect, name) if as_frames else joint_program(model, values, dialect, name)
 
 
 def _nearest_recorded(calibrated: Calibrated, kernel: Kernel, wanted: Array, in_base: bool) -> Array:

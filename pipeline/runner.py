@@ -26,6 +26,7 @@ from pipeline.runs import (
 )
 from pipeline.schemas import proposal
 from pipeline.stages.base import Context, Outcome, Stage
+from pipeline.stages.joint_log import check_joint_limits
 from pipeline.stages.registry import STAGES
 from robcal.errors import InvalidInput, RobcalError
 
@@ -92,6 +93,7 @@ def run_campaign(
     with run.lock():
         messages.log = run.log
         messages.record(f"run of {campaign.path} in {run.folder}")
+        check_joint_limits(campaign, run)
         _adopt(run, campaign)
         run.load_hashes()
         context = Context(campaign, run, messages, workers or processes(), body)

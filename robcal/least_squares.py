@@ -21,6 +21,8 @@ from robcal.errors import InvalidInput
 Array = NDArray[np.float64]
 State = TypeVar("State")
 
+RELEASE = 4.0
+"""Factor by which steps may grow after one that lowered the cost as foreseen, or shrink after a halved one."""
 RELATIVE_PIVOT = 1e-11  # squared; below this a column is numerically a combination of others
 
 
@@ -121,8 +123,9 @@ def gauss_newton(
         seconds = time.perf_counter() - clock
         return SolveSummary(converged, len(history) - 1, why, history[0], cost, tuple(history), halvings, seconds)
 
+    room = 1.0
     for _ in range(settings.max_iterations):
-        step = solve_step(r, J, usual)
+        step = solve_step(r, J, None if usual is None else room * usual)
         predicted = J @ step
         promise = float(r @ predicted - 0.5 * predicted @ predicted)
         small = settings.cost_tolerance * (1.0 + cost)
@@ -141,6 +144,8 @@ def gauss_newton(
             near = promise <= 1e-3 + 1e-6 * cost  # a few hundredths of a standard deviation
             return state, summary(near, "no fraction of the step lowers the cost")
         gained, state, cost = cost - new_cost, candidate, new_cost
+        # as long as steps keep their promise the damping fades, and the last ones are undamped
+        room = room * RELEASE if gained > 0.75 * promise else room if length == 1.0 else room / RELEASE
         history.append(cost)
         if gained <= small and length == 1.0:
             return state, summary(True, "the last step lowered the cost by less than the tolerance")

@@ -115,7 +115,7 @@ def log_so3(a_R_b: ArrayLike) -> Array:
     squares = np.stack([trace, flat[:, 0, 0], flat[:, 1, 1], flat[:, 2, 2]], axis=1)
     best = np.argmax(squares, axis=1)
     quaternion = np.empty((len(flat), 4))
-    for choice in range(4):
+    for choice in np.unique(best):
         rows = best == choice
         M = flat[rows]
         if choice == 0:

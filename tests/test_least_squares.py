@@ -99,3 +99,22 @@ def test_global_test_judges_the_variance() -> None:
     assert 0.4 < p < 0.6
     assert global_test(0.5 * 400.0, 100)[1] < 1e-10
     assert global_test(1.0, 0) == (1.0, 1.0)
+
+
+def test_damping_keeps_nearly_open_directions_in_bounds_and_fades() -> None:
+    """Two columns nearly alike: the first step stays near what is usual, the last ones find the exact minimum."""
+    rng = np.random.default_rng(3)
+    J = rng.normal(size=(40, 2))
+    J[:, 1] = J[:, 0] + 1e-3 * J[:, 1]
+    truth = np.array([3.0, -2.0])
+    seen: list[np.ndarray] = []
+
+    def lin(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        seen.append(x)
+        return J @ (truth - x), J
+
+    usual = np.full(2, 0.05)
+    x, summary = gauss_newton(lin, lambda x: J @ (truth - x), lambda x, d: x + d, np.zeros(2), usual=usual)
+    assert summary.converged
+    assert np.abs(seen[1]).max() < 1.0  # the undamped step would go to the truth at once
+    np.testing.assert_allclose(J @ x, J @ truth, atol=1e-2)

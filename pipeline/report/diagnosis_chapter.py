@@ -207,6 +207,12 @@ def _gain(material: Material, d: Mapping[str, Any]) -> list[Block]:
     before, after = number(held.get("before")), number(held.get("after"))
     text = f"On {kept} the error is {before} {unit} (RMS) before and {after} after"
     text += f"; the noise of the measurement alone gives {number(floor)} {unit}." if floor else "."
+    region = held.get("region")
+    if region and d.get("mismatch"):
+        text += (
+            f" At one end of the measured space, predicted from all other poses, it is {number(region.get('before'))} "
+            f"{unit} before and {number(region.get('after'))} after: what parameters absorb shows there first."
+        )
     blocks: list[Block] = [Text(text)]
     evidence = material.evidence
     if evidence and d.get("mismatch") and len(evidence.poses):

@@ -15,7 +15,7 @@ from pipeline.poses_table import Poses
 from pipeline.robot_file import write_robot
 from pipeline.runs import Run
 from pipeline.stages.base import Context, Outcome, Stage
-from pipeline.stages.joint_log import check_joint_log
+from pipeline.stages.joint_log import check_failed_fit, check_joint_log
 from pipeline.stages.observations import RobotObservations, RobotRecording, Rows, build_recording, rescaled
 from robcal.calibration.identification import IdentifiedRobot, IdentifyOptions, identify
 from robcal.calibration.observations import FrameObservations
@@ -76,6 +76,8 @@ def work(context: Context) -> Outcome:
     check_joint_log(robot, poses, inputs, recording, kernel)
     nominal = fit_nominal(robot, inputs.subset(rows), recording.select(rows))
     found, recording = identify_recording(robot, inputs, recording, rows, options, kernel)
+    if recording.stated:
+        check_failed_fit(robot, poses, inputs, recording, kernel, found.sigma0)
     calibrated = calibrated_robot(poses, inputs, found, nominal.model)
     facts = {f.name: getattr(found, f.name) for f in fields(found) if f.name != "kernel"}
     outputs = [run.save(NAME, Identification(rows, facts, recording)), run.save(f"calibrated_{NAME}", calibrated)]

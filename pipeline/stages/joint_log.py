@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
+from pipeline.bodies import body_for_robot
+from pipeline.calibrated import recorded_inputs
+from pipeline.campaign import Campaign
 from pipeline.poses_table import Poses
-from pipeline.stages.observations import RobotRecording
+from pipeline.runs import Run
+from pipeline.stages.observations import RobotRecording, build_recording
 from robcal.calibration.observations import FrameObservations, PointObservations
-from robcal.calibration.plausibility import likely_causes
-from robcal.errors import InvalidInput
+from robcal.calibration.plausibility import SUSPICIOUS_SHARE, likely_causes
+from robcal.errors import InvalidInput, RobcalError
 from robcal.robot.kernel import Kernel, PoseInputs
 from robcal.robot.model import RobotModel
+
+FAILED = 10.0
+"""sigma0 of the stated uncertainty above which a fit counts as failed."""
+MOST_POSES = 300
 
 _REMEDIES = {
     "slipped_rows": "bring poses and measurements together again",
@@ -32,13 +42,58 @@ def check_joint_log(
     InvalidInput : a fault that explains the miss was found; the message gives the proof and the remedy.
     """
     _check_unit(poses, inputs, recording, kernel)
-    found = likely_causes(robot, inputs, recording.observations, kernel)
-    if found:
-        best = found[0]
-        raise InvalidInput(
-            f"{poses.path}: joint angles and measurements do not belong together: {best.statement}: "
-            f"{_REMEDIES.get(best.kind, 'correct the recording')}"
-        )
+    fault = _fault(robot, inputs, recording, kernel)
+    if fault:
+        raise InvalidInput(f"{poses.path}: joint angles and measurements do not belong together: {fault}")
+
+
+def check_failed_fit(
+    robot: RobotModel, poses: Poses, inputs: PoseInputs, recording: RobotRecording, kernel: Kernel, sigma0: float
+) -> None:
+    """Where even the identified robot misses by many sigmas, look for smaller slips (a sign of the last joint, say).
+
+    Raises
+    ------
+    InvalidInput : a fault that explains the miss was found; the message gives the proof and the remedy.
+    """
+    if sigma0 < FAILED:
+        return
+    rows = np.arange(min(len(inputs), MOST_POSES))
+    few = replace(recording, observations=recording.select(rows))
+    fault = _fault(robot, inputs.subset(rows), few, kernel, share=0.0)
+    if fault:
+        raise InvalidInput(f"{poses.path}: joint angles and measurements do not belong together: {fault}")
+
+
+def check_joint_limits(campaign: Campaign, run: Run) -> None:
+    """Refuse poses beyond the robot's ranges; where a slip in the recording explains them, name it with the proof.
+
+    Raises
+    ------
+    InvalidInput : some pose is beyond a range of the robot file.
+    """
+    poses, robot = campaign.poses, campaign.robot
+    if poses is None or robot is None or not poses.outside:
+        return
+    fault = ""
+    if campaign.measurements:
+        kernel = Kernel(robot, campaign.entry.model.statics)
+        try:
+            recording = build_recording(campaign, run, body_for_robot(campaign, run))
+            fault = _fault(robot, recorded_inputs(kernel, poses), recording, kernel)
+        except RobcalError:
+            fault = ""  # what else is wrong comes to light once the angles are within the ranges
+    raise InvalidInput(poses.outside + (f"; a likely cause: {fault}" if fault else ""))
+
+
+def _fault(
+    robot: RobotModel, inputs: PoseInputs, recording: RobotRecording, kernel: Kernel, share: float = SUSPICIOUS_SHARE
+) -> str:
+    """The likeliest slip with proof and remedy; empty if there is none."""
+    found = likely_causes(robot, inputs, recording.observations, kernel, share)
+    if not found:
+        return ""
+    return f"{found[0].statement}: {_REMEDIES.get(found[0].kind, 'correct the recording')}"
 
 
 def _check_unit(poses: Poses, inputs: PoseInputs, recording: RobotRecording, kernel: Kernel) -> None:

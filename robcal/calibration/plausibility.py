@@ -80,10 +80,12 @@ def outside_limits(model: RobotModel, poses: PoseInputs) -> list[tuple[int, str,
 
 
 def likely_causes(
-    model: RobotModel, poses: PoseInputs, observations: Sequence[Observations], kernel: Kernel | None = None
+    model: RobotModel, poses: PoseInputs, observations: Sequence[Observations], kernel: Kernel | None = None,
+    share: float = SUSPICIOUS_SHARE,
 ) -> list[LikelyCause]:
     """Slips that explain why the nominal robot misses the measurements by far; best explanation first.
 
+    ``share`` of the workspace that the nominal robot may miss before anything is suspected; zero looks in any case.
     Empty if the nominal robot fits as robots do, or if nothing known mends the miss.
     """
     kernel = Kernel(model) if kernel is None else kernel
@@ -92,7 +94,7 @@ def likely_causes(
         before, per_pose = nominal_miss(kernel, poses, observations)
     except RobcalError:
         before, per_pose = np.inf, np.full(len(poses), np.inf)
-    if before < max(2e-3, SUSPICIOUS_SHARE * size):
+    if share > 0 and before < max(2e-3, share * size):
         return []
     found: list[LikelyCause] = []
     for kind, where, sentence, mended in _repairs(model, poses, per_pose, kernel, observations):

@@ -26,7 +26,7 @@ CONCEIVABLE = 5.0
 """Deviations that robots may have, as a standard deviation in units of the plausible ones."""
 USUAL_STEP = 2.5
 """Steps of the iteration that are common, in units of the plausible deviations."""
-MISFIT_LEVEL = 1e-4
+MISFIT_LEVEL = 1e-6
 """p-value, of what all candidates together would take off the sum of squares, below which too much was eliminated."""
 
 
@@ -158,7 +158,7 @@ class Engine:
         rejected = {
             names[k]: float(p) for k, p in zip(optional, picked.p_values, strict=True) if names[k] not in taken
         }
-        state = self._reset(solution.state, [n for n in (*own, *cross) if n not in taken])
+        state = self._moved(solution.state, (*forced, *taken), (*own, *cross), names, at_zero)
         gone = {n: e for n, e in solution.eliminated.items() if n not in taken}
         if set(taken) == set(solution.names) - set(forced):
             final = solution
@@ -171,6 +171,19 @@ class Engine:
                 final = solution
         iterations = solution.iterations + (final.iterations if final is not solution else 0)
         return replace(final, rejected=rejected, first=solution.first, iterations=iterations)
+
+    def _moved(
+        self, state: State, names: Sequence[str], zeroed: Sequence[str], all_names: Sequence[str], normals: Normals
+    ) -> State:
+        """Where the linear problem with the chosen names puts the state, those of ``zeroed`` counted from zero."""
+        at = [all_names.index(n) for n in names]
+        size = np.sqrt(np.maximum(np.diag(normals.N)[at], 1e-300))
+        try:
+            factor = linalg.cho_factor(normals.N[np.ix_(at, at)] / np.outer(size, size), check_finite=False)
+        except linalg.LinAlgError:
+            return self._reset(state, [n for n in zeroed if n not in names])
+        step = linalg.cho_solve(factor, normals.b[at] / size, check_finite=False) / size
+        return Problem(self.evaluator, self.columns(names), np.zeros(0)).retract(self._reset(state, zeroed), step)
 
     def _reset(self, state: State, names: Sequence[str]) -> State:
         theta = state.theta.copy()

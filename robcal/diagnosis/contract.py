@@ -38,6 +38,9 @@ def as_contract(diagnosis: Diagnosis) -> dict[str, object]:
             "after": number(diagnosis.heldout[1] * 1e3),
             "noise_floor": number(diagnosis.heldout[2] * 1e3),
             "kind": diagnosis.heldout_kind,
+            "region": None if diagnosis.region is None else dict(
+                zip(("before", "after"), (number(v * 1e3) for v in diagnosis.region), strict=True)
+            ),
         },
         "noise": {
             "stated": 1.0,

@@ -15,6 +15,7 @@ from robcal.diagnosis.naming import rivals, signature
 from robcal.diagnosis.next_poses import separating_poses
 from robcal.diagnosis.noise import estimate_noise
 from robcal.diagnosis.recording import Accepted, Fit, Recording, fit, observation_data, pseudo_covariance
+from robcal.diagnosis.region import region_errors
 from robcal.diagnosis.result import Diagnosis, Finding, Rival
 from robcal.diagnosis.selection import (
     PLAUSIBLE_DEVIATION,
@@ -133,6 +134,8 @@ def diagnose(
         free=final.free,
         next_poses=poses,
         seconds=time.perf_counter() - start,
+        region=region_errors(whole, fit(model, whole, free), final) if curves.accepted
+        else region_errors(chosen.recording, before, last.fit),
     )
 
 

@@ -289,8 +289,7 @@ def fit(
         return frames, residual, jacobian
 
     width = len(names) + sum(len(item.names) for item in direct)
-    brake = np.zeros((len(names), width))
-    brake[np.arange(len(names)), np.arange(len(names))] = [_brake(name) for name in names]
+    brake = np.diag(largest_steps(names, width))[: len(names)]
     sizes = {f"{term.name}.{short}": size for term in model.terms for short, size in term.priors.items()}
     held = np.array([k for k, name in enumerate(names) if name in sizes], dtype=np.intp)
     prior = np.zeros((len(held), width))
@@ -335,6 +334,11 @@ def fit(
         prior,
         -prior[:, : len(columns)] @ theta[columns],
     )
+
+
+def largest_steps(names: Sequence[str], columns: int) -> Array:
+    """Reciprocals (columns,) of the largest steps that make sense for named parameters; zero for amplitudes."""
+    return np.array([*map(_brake, names), *[0.0] * (columns - len(names))])
 
 
 def _brake(name: str) -> float:

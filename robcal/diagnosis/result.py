@@ -69,6 +69,8 @@ class Diagnosis:
         repeatability of the joints (rad) that the covariance did not know.
     unexplained_p, unexplained_pattern : what the last scan says.
     heldout : (before, after, noise floor) in metres; `heldout_kind` 'verify' or 'cross-validation'.
+    region : (before, after) in metres, at one end of the measured space predicted from all other poses that were used
+        to identify; None for short recordings.
     model : robot with everything accepted.
     """
 
@@ -86,6 +88,7 @@ class Diagnosis:
     next_poses: tuple[Mapping[str, float], ...] = ()
     seconds: float = 0.0
     notes: tuple[str, ...] = field(default=())
+    region: tuple[float, float] | None = None
 
     @property
     def mismatch(self) -> bool:

@@ -9,6 +9,7 @@ its joint lines allow one (:mod:`robcal.robot.structure`), Levenberg-Marquardt o
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import casadi as ca
@@ -45,7 +46,10 @@ class CSource:
     covariates: tuple[str, ...]
 
 
-def export_c(model: RobotModel, prefix: str | None = None, statics: str = "one_step") -> CSource:
+def export_c(
+    model: RobotModel, prefix: str | None = None, statics: str = "one_step",
+    defaults: Mapping[str, float] | None = None,
+) -> CSource:
     """C99 header and source of a robot.
 
     Parameters
@@ -53,6 +57,7 @@ def export_c(model: RobotModel, prefix: str | None = None, statics: str = "one_s
     model : calibrated robot; ``world_T_base`` and ``flange_T_tool`` become constants.
     prefix : of all public names; default the robot's name in lower case.
     statics : 'one_step' or 'converged', as the model was identified.
+    defaults : covariates that hold where a call does not know better (a temperature, say); zero where missing.
 
     Raises
     ------
@@ -75,7 +80,7 @@ def export_c(model: RobotModel, prefix: str | None = None, statics: str = "one_s
         "@COVARIATES@": str(len(covariates)),
         "@COVARIATE_SIZE@": str(max(1, len(covariates))),
         "@COVARIATE_NOTE@": f" /* {', '.join(covariates)} */" if covariates else "",
-        "@PAYLOADS@": _payloads(kernel, name),
+        "@PAYLOADS@": _payloads(kernel, name) + _defaults(covariates, defaults or {}, name),
     }
     parts = [
         f'/* {title} */\n#include <math.h>\n#include <string.h>\n\n#include "{name}.h"\n\n#define N {chain.n_joints}',
@@ -130,6 +135,15 @@ def _payloads(kernel: Kernel, prefix: str) -> str:
         lines.append(f"#define {prefix}_payload_{word} {{{number(mass)}, {array(cog)}}}")
     head = "\n/* Payloads of the campaign: initialisers of the structure above. */\n"
     return head + "\n".join(lines) + "\n" if lines else ""
+
+
+def _defaults(covariates: tuple[str, ...], values: Mapping[str, float], prefix: str) -> str:
+    """Initialiser of the conditions: no payload, covariates as at the first recorded pose."""
+    numbers = array(np.array([values.get(name, 0.0) for name in covariates] or [0.0]))
+    return (
+        "\n/* Conditions where nothing better is known: no payload, the rest as at the first recorded pose. */\n"
+        f"#define {prefix}_conditions_default {{{{0.0, {{0.0, 0.0, 0.0}}}}, {numbers}}}\n"
+    )
 
 
 def _tables(chain: Chain, world_T_base: Array) -> str:

@@ -22,7 +22,7 @@ typedef struct {
 
 typedef struct {
     @P@_payload payload;
-    double covariate[@COVARIATE_SIZE@]; /* in the order given above; 0 where not known */
+    double covariate[@COVARIATE_SIZE@]; /* in the order given above; see the default below */
 } @P@_conditions;
 @PAYLOADS@
 /* Results of the functions below. */

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,12 +23,10 @@ from robcal.robot.inverse import check_frames
 from robcal.robot.model import RobotModel
 from robcal.transforms import Array, log_so3, xyzrpy_from_frame
 
-Dialect = Literal["krl", "rapid", "urscript"]
-
 _NO_EXTERNAL = "9E9"
 
 
-def joint_program(model: RobotModel, q: ArrayLike, dialect: Dialect, name: str = "robcal_poses") -> str:
+def joint_program(model: RobotModel, q: ArrayLike, dialect: str, name: str = "robcal_poses") -> str:
     """Program that drives through joint values (n, N), stopping at each.
 
     Raises
@@ -47,7 +44,7 @@ def joint_program(model: RobotModel, q: ArrayLike, dialect: Dialect, name: str =
     return _program(_pick(lines, dialect)(chain, values, rotary, external), dialect, name)
 
 
-def frame_program(frames: ArrayLike, dialect: Dialect, name: str = "robcal_targets") -> str:
+def frame_program(frames: ArrayLike, dialect: str, name: str = "robcal_targets") -> str:
     """Program that drives to corrected Cartesian targets (n, 4, 4) in base coordinates (``Compensation.F_star``).
 
     The controller's tool and base must be those of the calibration; the configuration is the current one's.

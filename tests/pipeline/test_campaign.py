@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from pipeline.campaign import read_campaign
+from pipeline.runner import run_campaign
 from robcal.errors import InvalidInput
 from tests.pipeline.conftest import Rows, edit_rows, edit_yaml
 
@@ -106,7 +107,6 @@ def copy_first_row(rows: Rows) -> Rows:
     [
         ("poses.csv", set_cell(3, "q2_deg", "nan"), ["poses.csv, row 5", "q2_deg"]),
         ("poses.csv", set_cell(3, "q2_deg", "ten"), ["poses.csv, row 5", "not a number"]),
-        ("poses.csv", set_cell(0, "q1_deg", "300"), ["poses.csv, row 2", "outside the range", "axis1"]),
         ("poses.csv", set_cell(2, "payload", "dumbell"), ["row 4", "did you mean 'dumbbell'?"]),
         ("poses.csv", set_cell(2, "set", "check"), ["row 4", "'identify' or 'verify'"]),
         ("poses.csv", set_cell(2, "approach3", "2"), ["row 4", "approach3", "-1, 0 or +1"]),
@@ -173,3 +173,14 @@ def test_a_ring_id_that_no_ring_shows(image_campaign: Path) -> None:
 def test_bodies_of_contradictory_targets(point_campaign: Path) -> None:
     edit_yaml(point_campaign / "plate.yaml", lambda d: d["targets"].append(dict(d["targets"][0])))
     assert "stands twice" in refused(point_campaign)
+
+
+def test_poses_beyond_the_ranges_are_told_with_row_and_joint(point_campaign: Path) -> None:
+    """The run refuses them, after it has looked for a slip that explains them."""
+    edit_rows(point_campaign / "poses.csv", set_cell(0, "q1_deg", "300"))
+    poses = read_campaign(point_campaign).poses
+    assert poses is not None
+    for word in ("poses.csv, row 2", "outside the range", "axis1", "(1 such poses)"):
+        assert word in poses.outside
+    with pytest.raises(InvalidInput, match=r"row 2: q1_deg = 300 deg lies outside.*the range in the robot file$"):
+        run_campaign(point_campaign, point_campaign.parent / "run")

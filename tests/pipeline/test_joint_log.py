@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from fixtures.campaigns import make_campaign
 from pipeline.runner import run_campaign
 from robcal.errors import InvalidInput, NotIdentifiable, RobcalError
 from tests.pipeline.conftest import Rows, edit_rows, edit_yaml
@@ -49,6 +50,44 @@ def test_fault_is_named_with_proof(frame_campaign: Path, tmp_path: Path, fault, 
     told = str(error.value)
     for word in ["poses.csv", "do not belong together", *words]:
         assert word in told
+
+
+def wrong_sign_beyond_limits(rows: Rows) -> None:
+    for row in rows:
+        row["q2_deg"] = str(-float(row["q2_deg"]))
+
+
+def exchanged_beyond_limits(rows: Rows) -> None:
+    for row in rows:
+        row["q1_deg"], row["q2_deg"] = row["q2_deg"], row["q1_deg"]
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [(wrong_sign_beyond_limits, "joint 2 (axis2) is counted with the wrong sign"),
+     (exchanged_beyond_limits, "the columns of joints 1 and 2 are exchanged")],
+)
+def test_a_slip_that_leaves_the_ranges_is_named_as_well(
+    frame_campaign: Path, tmp_path: Path, fault, words: str
+) -> None:
+    edit_rows(frame_campaign / "poses.csv", fault)
+    with pytest.raises(InvalidInput, match="outside the range") as error:
+        run_campaign(frame_campaign, tmp_path / "run", until="identify")
+    assert f"a likely cause: {words}" in str(error.value) or f"a likely cause: the {words}" in str(error.value)
+    assert "mending it lowers the miss" in str(error.value)
+
+
+def test_a_small_slip_is_looked_for_where_the_fit_fails(tmp_path: Path) -> None:
+    """A draw-wire hardly notices the last joint: its wrong sign moves the end by less than robots are off."""
+    make_campaign(tmp_path / "campaign", seed=5, level="distances", poses=110, verify=12)
+
+    def change(rows: Rows) -> None:
+        for row in rows:
+            row["q6_deg"] = str(-float(row["q6_deg"]))
+
+    edit_rows(tmp_path / "campaign" / "poses.csv", change)
+    with pytest.raises(InvalidInput, match=r"axis6.*wrong sign.*mending it lowers"):
+        run_campaign(tmp_path / "campaign", tmp_path / "run", until="identify")
 
 
 def test_a_sound_log_passes(frame_campaign: Path, tmp_path: Path) -> None:

@@ -1,0 +1,101 @@
+"""What a run exports: C that says what predict says, also of terms of a diagnosis; programs of controllers."""
+
+from __future__ import annotations
+
+import csv
+import ctypes
+import re
+import shutil
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fixtures.campaigns import make_campaign
+from pipeline.calibrated import load_calibrated
+from pipeline.exports import export_run
+from pipeline.prediction import compensate_run, predict_run
+from pipeline.runner import run_campaign
+from pipeline.runs import open_run
+from pipeline.tables import read_table
+from robcal.errors import InvalidInput
+from robcal.robot.model import Term
+from tests.pipeline.conftest import edit_yaml
+
+TERMS = (
+    Term("axis2.hysteresis", "axis2", "q", "-0.5*width*approach2", {"width": 2e-4}),
+    Term("axis1.drift", "axis1", "q", "rate*(temp_arm_c - 20)", {"rate": 1e-5}),
+    Term("axis3.ripple", "axis3", "q", "a*cos(17*q3) + b*sin(17*q3)", {"a": 1e-4, "b": -2e-4}),
+    Term("axis2.lost", "axis2", "q", "a*tanh(torque2/800)", {"a": 1e-4}),
+)
+
+
+@pytest.fixture(scope="module", params=["one_step", "converged"])
+def finished(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A run whose robot carries terms such as a diagnosis adds."""
+    folder = tmp_path_factory.mktemp("exports")
+    make_campaign(folder / "campaign", seed=11, level="frames", poses=40, verify=10)
+    edit_yaml(
+        folder / "campaign" / "campaign.yaml",
+        lambda d: d.update(diagnosis={"enabled": False}, model={"statics": request.param}),
+    )
+    run_campaign(folder / "campaign", folder / "run", until="identify")
+    run = open_run(folder / "run")
+    found = load_calibrated(run)
+    assert found.statics == request.param
+    run.save("calibrated_identify", replace(found, model=found.model.with_terms(TERMS)))
+    return folder / "campaign", folder / "run"
+
+
+@pytest.mark.skipif(shutil.which("gcc") is None, reason="needs gcc")
+def test_compiled_forward_model_says_what_predict_says(finished: tuple[Path, Path], tmp_path: Path) -> None:
+    campaign, run = finished
+    written = export_run(run, tmp_path, tmp_path / "robot.urdf")
+    source = next(p for p in written if p.suffix == ".c")
+    header = source.with_suffix(".h").read_text()
+    flags = ["-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-O1", "-shared", "-fPIC"]
+    subprocess.run(["gcc", *flags, "-o", "bot.so", source.name, "-lm"], cwd=tmp_path, check=True)
+    library = ctypes.CDLL(str(tmp_path / "bot.so"))
+    covariates = re.search(r"COVARIATES \d+ /\* (.*?) \*/", header)
+    assert covariates is not None
+    names = covariates[1].split(", ")
+    assert set(names) == {"approach2", "temp_arm_c"}
+    loads = {name: [float(v) for v in re.findall(r"[-+.\de]+", text)]
+             for name, text in re.findall(r"_payload_(\w+) (\{.*)", header)}
+    predict_run(run, campaign / "poses.csv", tmp_path / "predicted.csv")
+    table = read_table(tmp_path / "predicted.csv")
+    expected = np.column_stack([table.numbers(f"{n}_mm") for n in "xyz"])
+    pointer = ctypes.POINTER(ctypes.c_double)
+    with (campaign / "poses.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    for row, place in zip(rows, expected, strict=True):
+        q = np.radians([float(row[f"q{k}_deg"]) for k in range(1, 7)])
+        conditions = np.array([*loads.get(row["payload"], [0.0] * 4), *(float(row[n]) for n in names)])
+        T = np.zeros(12)
+        getattr(library, f"{source.stem}_forward")(*(v.ctypes.data_as(pointer) for v in (q, conditions, T)))
+        # the table is written with six decimals of a millimetre: 1e-9 m
+        assert T[[3, 7, 11]] == pytest.approx(place * 1e-3, abs=1.1e-9)
+    first = rows[0]["temp_arm_c"]
+    assert re.search(rf"conditions_default {{{{0.0, {{0.0, 0.0, 0.0}}}}, {{.*{float(first)}.*}}}}", header)
+
+
+@pytest.mark.parametrize(("dialect", "word"), [("krl", "PTP"), ("rapid", "Move"), ("urscript", "movej")])
+@pytest.mark.parametrize("as_frames", [False, True])
+def test_programs_of_controllers(
+    finished: tuple[Path, Path], tmp_path: Path, dialect: str, word: str, as_frames: bool
+) -> None:
+    campaign, run = finished
+    predict_run(run, campaign / "poses.csv", tmp_path / "wanted.csv")
+    out = tmp_path / "2 parts.txt"
+    answer = compensate_run(run, tmp_path / "wanted.csv", out, as_frames=as_frames, program=dialect)
+    assert sum(word in line for line in out.read_text().splitlines()) == answer["frames"] == 50
+    assert "robcal_2_parts" in out.read_text()
+
+
+def test_an_unknown_controller_is_refused(finished: tuple[Path, Path], tmp_path: Path) -> None:
+    campaign, run = finished
+    predict_run(run, campaign / "poses.csv", tmp_path / "wanted.csv")
+    with pytest.raises(InvalidInput, match="krl, rapid or urscript"):
+        compensate_run(run, tmp_path / "wanted.csv", tmp_path / "o", program="karel")
