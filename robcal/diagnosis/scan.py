@@ -167,7 +167,7 @@ def scan(stacks: Sequence[Stack], residual: Array, redundancy: int) -> ScanResul
 
     Weakness: one variance factor for all rows; rows must be whitened with covariances right up to that factor.
     """
-    scores = [np.einsum("emc,m->ec", stack.basis, residual) for stack in stacks]
+    scores = [residual @ stack.basis for stack in stacks]
     raw = np.concatenate([np.sum(z**2, axis=1) for z in scores])
     family = np.concatenate([stack.family for stack in stacks])
     grid = np.concatenate([stack.grid for stack in stacks])
