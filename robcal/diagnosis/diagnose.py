@@ -258,7 +258,8 @@ def _findings(
         others = tuple(other for j, other in enumerate(final.accepted) if j != k)
         look = chosen.first
         if others:
-            look = analyse(fit(model, chosen.recording, chosen.free, others), chosen.recording, chosen.tied)
+            rest = fit(model, chosen.recording, chosen.free, others)
+            look = analyse(rest, chosen.recording, chosen.tied, level=chosen.first.family_wise)
         partial = fit(model, chosen.recording, chosen.free, final.accepted[: k + 1])
         after = _error(chosen.recording, partial, verify)
         findings.append(_finding(look, item, chosen.p_values[k], (error, after), chosen))
