@@ -12,7 +12,7 @@ from robcal.imaging.aruco_markers import find_markers
 from robcal.imaging.blobs import Candidates, step_all_around
 from robcal.imaging.coarse_dots import with_coarse_dots
 from robcal.imaging.detections import CodeState, Detections, Reason, RejectionLog, TargetKind, empty_columns
-from robcal.imaging.dot_fitting import FittedDots, blur_without_pixel, fit_dots, refit_coded
+from robcal.imaging.dot_fitting import FittedDots, blur_without_pixel, fit_dots, refit_ringed
 from robcal.imaging.noise import NoiseModel, estimate_noise
 from robcal.imaging.ring_code import RingReadings, read_rings
 from robcal.imaging.segmentation import find_candidates
@@ -151,13 +151,13 @@ def saturation_level(image: NDArray) -> float:
 def _read(
     image: NDArray, dots: FittedDots, noise: NoiseModel, saturation: float, settings: DetectionSettings
 ) -> tuple[RingReadings, FittedDots]:
-    """Readings of all dots; those with a code are fitted again without their ring's glare."""
+    """Readings of all dots; those with a ring, read or not, are fitted again without its glare."""
     readings = _readings(image, dots, noise, saturation, settings)
-    coded = np.flatnonzero(readings.code >= 0)
-    if coded.size:
-        again = refit_coded(image, dots, readings, coded, noise, saturation)
-        good = again.converged & (np.linalg.norm(again.xy - dots.xy[coded], axis=1) < 0.5) & ~again.is_spot
-        dots = dots.replaced(coded[good], again.take(good))
+    ringed = np.flatnonzero((readings.code >= 0) | (readings.evidence & readings.bits.any(axis=1)))
+    if ringed.size:
+        again = refit_ringed(image, dots, readings, ringed, noise, saturation)
+        good = again.converged & (np.linalg.norm(again.xy - dots.xy[ringed], axis=1) < 0.5) & ~again.is_spot
+        dots = dots.replaced(ringed[good], again.take(good))
     return readings, dots
 
 

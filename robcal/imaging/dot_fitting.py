@@ -25,6 +25,7 @@ Array = NDArray[np.float64]
 _PIXEL_VARIANCE = 1.0 / 12.0
 # systematic part of the centre that no noise covers (model misfit, pixel response), px; see edge_model
 _FLOOR_EDGE, _FLOOR_SPOT = 0.001, 0.006
+_GLARE_MAX = 0.015  # of the dot's contrast: light of a ring that is taken off; pixels with more are left out
 _PIXELS_MIN = 12  # pixels with information that a fit of twelve parameters needs at least
 _SPOT_RATIO, _SPOT_RATIO_ROUND = 1.7, 1.2  # minor semi-axis by s below which a tilted, a round dot is a spot
 
@@ -104,10 +105,14 @@ def fit_dots(
     return _join(results, groups), noise, prior
 
 
-def refit_coded(
+def refit_ringed(
     image: NDArray, dots: FittedDots, readings: RingReadings, rows: NDArray, noise: NoiseModel, saturation: float
 ) -> FittedDots:
-    """Fits the coded dots `rows` again with the glare of their own ring taken off; the ring blurs into the gap."""
+    """Fits the dots `rows` again with the glare of their own ring taken off, or left out where it is strong.
+
+    The ring blurs into the gap. For round dots of 2.5 to 6 px radius taking it off alone leaves a bias of up to
+    0.025 px towards the ring, no correction up to 0.05 px; this one leaves less than 0.008 px.
+    """
     candidates = dots.take(rows).as_candidates()
     groups = gather_windows(image, candidates, saturation, neighbours=False)
     results = []
@@ -115,13 +120,14 @@ def refit_coded(
         source = rows[window.index]
         local = dots.xy[source] - window.origin
         glare = ring_glare(local, dots.b[source], dots.s[source], readings, source, window.x, window.y)
+        # where the glare is more than a little its model's errors would tilt the background and pull the centre; and
         # foreign light in the window that the code does not explain
         background, contrast, s, major, cx, cy = (
             column.astype(np.float32)[:, None]
             for column in (dots.background[source], dots.contrast[source], dots.s[source], dots.semi_axes[source, 0],
                            local[:, 0], local[:, 1])
         )  # fmt: skip
-        clean = replace(window, value=window.value - glare * contrast, valid=window.valid & (glare < 0.12))
+        clean = replace(window, value=window.value - glare * contrast, valid=window.valid & (glare < _GLARE_MAX))
         far = (window.x - cx) ** 2 + (window.y - cy) ** 2 > (major + 2.0 * s + 0.7) ** 2
         clean = replace(clean, valid=clean.valid & ~(far & (clean.value > background + 0.2 * contrast)))
         fit = iterate(_start(candidates, clean), clean, noise, 6, tolerance=0.1)
