@@ -152,10 +152,12 @@ def _system(
     """
     n = len(parameters)
     columns, weighted = (buffer[:n] for buffer in buffers)
-    model, _ = evaluate(parameters, windows, is_spot, columns)
-    residual = np.subtract(windows.value, model, out=columns[:, PARAMETERS])
-    np.multiply(columns, _weight(precision, windows, residual)[:, None], out=weighted)
-    products = np.matmul(weighted, columns.transpose(0, 2, 1)).astype(np.float64)
+    # a step into nowhere exceeds single precision; it is not taken, its cost is no number
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        model, _ = evaluate(parameters, windows, is_spot, columns)
+        residual = np.subtract(windows.value, model, out=columns[:, PARAMETERS])
+        np.multiply(columns, _weight(precision, windows, residual)[:, None], out=weighted)
+        products = np.matmul(weighted, columns.transpose(0, 2, 1)).astype(np.float64)
     normal = 0.5 * (products[:, :PARAMETERS, :PARAMETERS] + products[:, :PARAMETERS, :PARAMETERS].transpose(0, 2, 1))
     right, cost = products[:, :PARAMETERS, PARAMETERS].copy(), products[:, PARAMETERS, PARAMETERS].copy()
     # priors
