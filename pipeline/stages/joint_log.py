@@ -74,8 +74,8 @@ def check_failed_fit(
     if miss > max(HOPELESS, HOPELESS_SHARE * size):
         raise InvalidInput(
             f"{poses.path}: even the identified robot misses the measurements by {1e3 * miss:.3g} mm RMS: joint "
-            "angles, robot file and measurements do not belong together, and no single slip (sign, unit, exchanged columns, "
-            "shifted rows) explains it: check which recording belongs to which"
+            "angles, robot file and measurements do not belong together, and no single slip (sign, unit, exchanged "
+            "columns, shifted rows) explains it: check which recording belongs to which"
         )
 
 
