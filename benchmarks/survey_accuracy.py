@@ -1,8 +1,9 @@
 """Accuracy of a survey from rendered images: coordinates, scale, and whether the stated covariance is true.
 
 Run: ``python -m benchmarks.survey_accuracy [--images 60] [--seeds 1 2 3] [--size 1.0] [--small]``. Each row is one
-campaign: a plate of 25 codes and 100 dots with a scale bar, photographed all around by a self-calibrating camera of 5
-megapixels (``--small``: 1.3), lamps, screws and glints lying about. Goals: RMS after alignment below 5 um, scale within
+campaign: a plate of 25 codes and 100 dots with a scale bar (``--body sphere``: a sphere of 0.4 m with 48 codes and 102
+dots, seen from outside), photographed all around by a self-calibrating camera of 5 megapixels (``--small``: 1.3),
+lamps, screws and glints lying about. Goals: RMS after alignment below 5 um, scale within
 20 ppm, normalised estimation error squared per degree of freedom between 0.8 and 1.2.
 
 Rendered images are kept in ``--cache`` (about 2.5 GB per hundred images of full size).
@@ -51,14 +52,21 @@ class Accuracy:
     survey_s: float
 
 
-def rendered(cache: Path, *, images: int, size: float, seed: int, small: bool, start: str, listed: bool = True) -> Path:
+def rendered(
+    cache: Path, *, images: int, size: float, seed: int, small: bool, start: str, listed: bool = True,
+    body: str = "plate",
+) -> Path:  # fmt: skip
     """Folder with campaign/ and truth/, rendered if it is not there yet."""
     name = f"survey-{images}-{size:g}-{seed}{'-small' if small else ''}-{start}{'' if listed else '-unlisted'}"
+    name += "" if body == "plate" else f"-{body}"
     folder = cache / name
     if not (folder / "done").exists():
         camera = {"width": 1280, "height": 1024, "focal_mm": 8.0, "pixel_um": 4.8} if small else {}
         plate = target_plate(size=size, diameter=(0.014 if small else 0.010) * size, seed=seed)
-        plan = full_campaign(seed=seed, survey_images=images, identify=0, verify=0, body=plate, **camera)
+        plan = full_campaign(
+            seed=seed, survey_images=images, identify=0, verify=0, body=plate, sphere=body == "sphere", **camera
+        )
+        plan = replace(plan, surveys=tuple(survey for survey in plan.surveys if survey.name == body))
         write_image_campaign(
             replace(plan, start_values=start, bars_listed=listed), folder / "campaign", folder / "truth"
         )
@@ -74,11 +82,16 @@ def detect(path_and_codes: tuple[Path, frozenset[int]]) -> Detections:
     return detect_targets(image, DetectionSettings(known_codes=codes))
 
 
+def body_of(folder: Path) -> str:
+    """Name of the surveyed body."""
+    return next(iter(yaml.safe_load((folder / "campaign" / "campaign.yaml").read_text())["bodies"]))
+
+
 def centroid_errors(folder: Path, detections: dict[str, Detections]) -> Array:
     """Differences (n, 2) px between detected centres and true centres of area, of wholly visible targets."""
     errors = []
     for name, found in detections.items():
-        with (folder / "truth" / "survey" / "plate" / f"{name}.csv").open() as stream:
+        with (folder / "truth" / "survey" / body_of(folder) / f"{name}.csv").open() as stream:
             rows = [r for r in csv.DictReader(stream) if float(r["visible"]) > 0.999]
         true = np.array([[float(r["x_area_px"]), float(r["y_area_px"])] for r in rows])
         if len(true) == 0 or len(found.xy) == 0:
@@ -91,7 +104,7 @@ def centroid_errors(folder: Path, detections: dict[str, Detections]) -> Array:
 
 def survey(folder: Path, workers: int) -> tuple[SurveyResult, dict[str, Detections], float, float]:
     """Detect and adjust; seconds of both."""
-    campaign = yaml.safe_load((folder / "campaign" / "campaign.yaml").read_text())["bodies"]["plate"]
+    campaign = yaml.safe_load((folder / "campaign" / "campaign.yaml").read_text())["bodies"][body_of(folder)]
     entries = yaml.safe_load((folder / "campaign" / campaign["targets"]).read_text())["targets"]
     targets = [
         BodyTarget(
@@ -134,7 +147,7 @@ def matched(result: SurveyResult, folder: Path) -> tuple[Array, Array, Array]:
 
     Codes are matched by id, dots (which the survey names itself) by their place.
     """
-    body = json.loads((folder / "truth" / "truth.json").read_text())["bodies"]["plate"]
+    body = json.loads((folder / "truth" / "truth.json").read_text())["bodies"][body_of(folder)]
     true = np.array(body["xyz_mm"]) / 1e3
     true_rows = {int(i): k for k, i in enumerate(body["ids"]) if body["coded"][k]}
     ids, points = np.asarray(result.network.ids), np.asarray(result.network.points)
@@ -152,7 +165,7 @@ def matched(result: SurveyResult, folder: Path) -> tuple[Array, Array, Array]:
 
 
 def _bar_ids(folder: Path) -> list[int]:
-    survey_truth = json.loads((folder / "truth" / "truth.json").read_text())["surveys"]["plate"]
+    survey_truth = json.loads((folder / "truth" / "truth.json").read_text())["surveys"][body_of(folder)]
     return [i for bar in survey_truth["bars"] for i in bar["targets"]]
 
 
@@ -207,6 +220,7 @@ def main() -> None:
     parser.add_argument("--images", type=int, default=60)
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3])
     parser.add_argument("--size", type=float, default=1.0, help="side of the plate, m")
+    parser.add_argument("--body", choices=("plate", "sphere"), default="plate")
     parser.add_argument("--small", action="store_true", help="images of 1.3 megapixels")
     parser.add_argument("--start", choices=("none", "rough"), default="none")
     parser.add_argument("--bars-unlisted", action="store_true", help="the body file does not list the scale bars")
@@ -218,7 +232,7 @@ def main() -> None:
     for seed in given.seeds:
         folder = rendered(
             given.cache, images=given.images, size=given.size, seed=seed, small=given.small, start=given.start,
-            listed=not given.bars_unlisted,
+            listed=not given.bars_unlisted, body=given.body,
         )  # fmt: skip
         a = judge(folder, given.workers)
         print(

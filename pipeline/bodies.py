@@ -24,6 +24,9 @@ def body_from_file(name: str, file: BodyFile) -> Body:
     if any(t.sigma is not None for t in rows):
         sigma = np.array([t.sigma if t.sigma is not None else (0.0,) * 3 for t in rows], dtype=float)
         covariance = np.diag(sigma.ravel() ** 2)
+    normals = None
+    if any(t.normal is not None for t in rows):
+        normals = np.array([t.normal if t.normal is not None else (np.nan,) * 3 for t in rows], dtype=float)
     return Body(
         name=name,
         ids=np.array([t.id for t in rows], dtype=np.int64),
@@ -32,6 +35,7 @@ def body_from_file(name: str, file: BodyFile) -> Body:
         codes=tuple(t.code for t in rows),
         diameters=np.array([np.nan if t.diameter is None else t.diameter for t in rows], dtype=float),
         polarity=rows[0].polarity,
+        normals=normals,
     )
 
 

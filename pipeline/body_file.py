@@ -49,6 +49,7 @@ class BodyTargetRow:
     xyz: tuple[float, float, float] | None
     sigma: tuple[float, float, float] | None
     polarity: str
+    normal: tuple[float, float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -111,6 +112,7 @@ def read_body(path: Path | str) -> BodyFile:
                 xyz=None if target.xyz_mm is None else _metres(target.xyz_mm),
                 sigma=None if sigma is None else _metres(sigma if isinstance(sigma, tuple) else (sigma,) * 3),
                 polarity=target.polarity or entry.polarity,
+                normal=None if target.normal is None else _unit(target.normal, where),
             )
         )
     if not rows:
@@ -120,6 +122,14 @@ def read_body(path: Path | str) -> BodyFile:
 
 def _metres(values: Sequence[float]) -> tuple[float, float, float]:
     x, y, z = (v / 1000.0 for v in values)
+    return (x, y, z)
+
+
+def _unit(values: Sequence[float], where: str) -> tuple[float, float, float]:
+    length = float(np.linalg.norm(values))
+    if not 0.5 < length < 2.0:
+        raise InvalidInput(f"{where}: normal has the length {length:g}: it is a direction of length 1")
+    x, y, z = (v / length for v in values)
     return (x, y, z)
 
 
@@ -152,6 +162,7 @@ def write_body(
     codes: Sequence[str | None] | None = None,
     diameters: Sequence[float | None] | None = None,
     polarity: str = "bright",
+    normals: Array | None = None,
     comment: str = "",
 ) -> None:
     """Write a body with coordinates (n, 3) in m and their covariance (3n, 3n) atomically.
@@ -167,6 +178,8 @@ def write_body(
         row["diameter_mm"] = round(float(diameter) * 1000, 9) if diameter is not None and known else None
         row["xyz_mm"] = [round(float(v), 9) for v in np.asarray(points[i]) * 1000]
         row["sigma_mm"] = None if sigma is None else [float(f"{v:.4g}") for v in sigma[i]]
+        if normals is not None and np.isfinite(normals[i]).all():
+            row["normal"] = [round(float(v), 6) for v in normals[i]]
         targets.append(row)
     data: dict[str, Any] = {"format": FORMAT}
     if polarity != "bright":

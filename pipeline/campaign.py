@@ -90,12 +90,17 @@ class Campaign:
     @property
     def has_images(self) -> bool:
         """Whether any image file has to be searched for targets."""
-        surveys = [b.survey for b in self.bodies.values() if b.survey is not None]
-        return any(source.images for source in [*surveys, *self.cameras.values()])
+        return any(source.images for source in all_sources(self))
 
     def measured(self, kind: str) -> tuple[MeasuredTable, ...]:
         """Tables of one kind."""
         return tuple(table for table in self.measurements if table.kind == kind)
+
+
+def all_sources(campaign: Campaign) -> list[ImageSource]:
+    """The sources of images or marks of all surveys and cameras."""
+    surveys = [body.survey for body in campaign.bodies.values() if body.survey is not None]
+    return [*surveys, *campaign.cameras.values()]
 
 
 def campaign_file(path: Path) -> Path:
@@ -173,9 +178,14 @@ class _Reader:
         return InvalidInput(f"{self.path}{f', line {line}' if line else ''}: {message}")
 
     def _file(self, name: str) -> Path:
-        path = self.path.parent / name
+        path = self._place(name)
         self.files.append(path)
         return path
+
+    def _place(self, name: str) -> Path:
+        """A path as written in the file, relative to it; backslashes of another system are understood."""
+        path = self.path.parent / name
+        return self.path.parent / name.replace("\\", "/") if "\\" in name and not path.exists() else path
 
     def _check_whole(self) -> None:
         entry = self.entry
@@ -201,6 +211,13 @@ class _Reader:
             return None
         robot = read_robot(self._file(self.entry.robot))
         loads = {name: load.payload() for name, load in self.entry.payloads.items()}
+        own = sum(frame.mass for frame in robot.frames)
+        for name, load in loads.items():
+            if own > 0 and load.mass > 3.0 * own:
+                self.warnings.append(
+                    f"{self.path}: payload '{name}' of {load.mass:g} kg is {load.mass / own:.0f} times as heavy as the "
+                    f"robot ({own:g} kg): check the unit, masses are in kg"
+                )
         return replace(robot, payloads={**robot.payloads, **loads})
 
     def _body(self, name: str) -> BodySource:
@@ -222,13 +239,13 @@ class _Reader:
         if (entry.images is None) == (entry.observations is None):
             raise self._error(place, f"{what} needs either 'images' (a folder) or 'observations' (a CSV file)")
         start = read_camera(self._file(camera)) if camera is not None else None
-        start_path = self.path.parent / camera if camera is not None else None
+        start_path = self._place(camera) if camera is not None else None
         size = entry.size_px
         if start is not None:
             size = (start.camera.width, start.camera.height)
         if entry.observations is not None:
             return ImageSource({}, read_marks(self._file(entry.observations)), start, start_path, size)
-        folder = self.path.parent / str(entry.images)
+        folder = self._place(str(entry.images)).absolute()  # the report looks for them from anywhere
         return ImageSource(list_images(folder, what), None, start, start_path, size)
 
     def _station(self, poses: Poses | None) -> dict[str, ImageSource]:

@@ -14,7 +14,8 @@ FORMAT = "robcal/campaign-1"
 
 def _folder_name(value: Any) -> Any:
     text = str(value)
-    if not text.strip() or text in {".", ".."} or any(c in text for c in "/\\\0") or len(text) > 120:
+    usable = text.strip() and text.isprintable() and not any(c in text for c in "/\\")
+    if not usable or text in {".", ".."} or len(text) > 120:
         raise ValueError(f"must be a plain name without slashes (it names the run folder), found {text[:60]!r}")
     return text
 

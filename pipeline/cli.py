@@ -71,13 +71,15 @@ def _wrong_use(sentence: str) -> None:
     raise typer.Exit(2)
 
 
-def _check_stage(*names: str | None) -> None:
+def _check_stages(start: str | None, until: str | None) -> None:
     from pipeline.runner import STAGE_NAMES
     from pipeline.schemas import proposal
 
-    for name in names:
+    for name in (until, start):
         if name is not None and name not in STAGE_NAMES:
             _wrong_use(f"there is no stage '{name}'{proposal(name, list(STAGE_NAMES))}")
+    if start and until and STAGE_NAMES.index(until) < STAGE_NAMES.index(start):
+        _wrong_use(f"stage '{until}' comes before '{start}': --until must not lie before --from")
 
 
 def _summary(done: Any) -> dict[str, Any]:
@@ -102,7 +104,7 @@ def run(
     Stages: detect, survey, orient, measure, frames, identify, diagnose, verify, report.
     """
     with _answers("run", as_json) as answer:
-        _check_stage(until, start)
+        _check_stages(start, until)
         from pipeline.runner import run_campaign
 
         messages = Messages(quiet)

@@ -20,6 +20,7 @@ from robcal.errors import InvalidInput
 SUFFIXES = frozenset({".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp"})
 MAX_BYTES = 1_500_000_000
 MAX_PIXELS = 400_000_000
+MAX_DECODED_BYTES = 1_000_000_000
 
 GreyImage = NDArray[np.uint8 | np.uint16]
 
@@ -35,7 +36,7 @@ def list_images(folder: Path, what: str) -> dict[str, Path]:
 
     Raises
     ------
-    InvalidInput : the folder is missing or has no images.
+    InvalidInput : the folder is missing or has no images; something that is no file bears an image's name.
     """
     if not folder.exists():
         raise InvalidInput(f"{folder}: no such folder, {what} needs its images there: check the name in campaign.yaml")
@@ -47,6 +48,10 @@ def list_images(folder: Path, what: str) -> dict[str, Path]:
         raise InvalidInput(f"{folder}: cannot be read: {error.strerror or error}") from None
     if not found:
         raise InvalidInput(f"{folder}: no images in this folder, {what} needs some (PNG, TIFF, JPEG or BMP)")
+    for path in found:
+        if not path.is_file():
+            what = "a link to a file that is not there" if path.is_symlink() else "a folder or a device, no image"
+            raise InvalidInput(f"{path}: is {what}: remove or rename it")
     return {p.name: p for p in sorted(found, key=lambda p: natural_key(p.name))}
 
 
@@ -78,12 +83,14 @@ def _check_complete(path: Path, raw: bytes) -> None:
     """Decoders fill up what is missing with grey without a word, so the file's own end marks are checked first."""
     truncated = False
     width = height = 0
+    depth = 1
     if not raw:
         raise InvalidInput(f"{path}: empty image file: copy it again or remove it")
     if raw.startswith(b"\x89PNG\r\n\x1a\n"):
         truncated = b"IEND" not in raw[-4096:] and b"IEND" not in raw
-        if len(raw) >= 24:
-            width, height = struct.unpack(">II", raw[16:24])
+        if len(raw) >= 26:
+            width, height, bits, kind = struct.unpack(">IIBB", raw[16:26])
+            depth = (2 if bits == 16 else 1) * {2: 3, 3: 3, 4: 2, 6: 4}.get(kind, 1)
     elif raw.startswith(b"\xff\xd8"):
         # the last start of scan belongs to the main image; its end mark must follow it
         truncated = raw.rfind(b"\xff\xd9") < raw.rfind(b"\xff\xda")
@@ -96,6 +103,9 @@ def _check_complete(path: Path, raw: bytes) -> None:
         raise InvalidInput(f"{path}: is not a PNG, TIFF, JPEG or BMP image in spite of its name: convert or remove it")
     if abs(width) * abs(height) > MAX_PIXELS:
         raise InvalidInput(f"{path}: {abs(width)} x {abs(height)} pixels are more than {MAX_PIXELS}: crop the image")
+    if abs(width) * abs(height) * depth > MAX_DECODED_BYTES:
+        size = abs(width) * abs(height) * depth / 1e9
+        raise InvalidInput(f"{path}: {size:.1f} GB of colour values: save the image as grey values, or crop it")
     if truncated:
         raise InvalidInput(f"{path}: truncated image, its end is missing: copy it again or remove it")
 

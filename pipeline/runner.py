@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pipeline.campaign import Campaign, read_campaign
+from pipeline.campaign import Campaign, all_sources, read_campaign
 from pipeline.codec import StaleCache
 from pipeline.files import storage_error
 from pipeline.messages import Messages
@@ -94,7 +94,9 @@ def run_campaign(
         messages.log = run.log
         messages.record(f"run of {campaign.path} in {run.folder}")
         check_joint_limits(campaign, run)
-        _adopt(run, campaign)
+        moved = _adopt(run, campaign)
+        if moved is not None:
+            messages.info(moved)
         run.load_hashes()
         context = Context(campaign, run, messages, workers or processes(), body)
         for note in campaign.notes:
@@ -108,25 +110,44 @@ def run_campaign(
 
 
 def _keep_inputs_apart(campaign: Campaign, run: Run) -> None:
-    folder = campaign.path.parent.resolve()
-    if run.folder.resolve() == folder:
+    out = run.folder.resolve()
+    if out == campaign.path.parent.resolve():
         raise InvalidInput(f"{run.folder}: is the campaign itself, which is never written to: choose another --out")
+    images = [path for source in all_sources(campaign) for path in source.images.values()]
+    recorded = {path.parent.resolve() for path in (*campaign.files, *images)}
+    if out in recorded:
+        raise InvalidInput(f"{run.folder}: holds recordings of the campaign: choose another --out")
+    strangers = [path.name for path in run.contract_files() if path.exists()]
+    if strangers and not run_file(run).is_file():
+        raise InvalidInput(
+            f"{run.folder}: is no run folder but holds {strangers[0]}, which would be overwritten: choose another --out"
+        )
 
 
-def _adopt(run: Run, campaign: Campaign) -> None:
+def _adopt(run: Run, campaign: Campaign) -> str | None:
+    """Take the run folder for this campaign; a sentence where it was that of the same campaign in another place.
+
+    Raises
+    ------
+    InvalidInput : the folder holds the run of another campaign.
+    """
     path = run_file(run)
     here = str(campaign.path.resolve())
     try:
         known = read_json(path) if path.is_file() else {}
     except InvalidInput:
         known = {}  # damaged: written anew, and every stage's record is checked by itself
+    moved = None
     if known and known.get("campaign") != here:
-        before = known.get("name")
-        if before != campaign.name:
+        before, there = known.get("name"), str(known.get("campaign"))
+        if before != campaign.name or Path(there).exists():
             raise InvalidInput(
-                f"{run.folder}: holds the run of another campaign ('{before}'): choose another folder with --out"
+                f"{run.folder}: holds the run of another campaign ('{before}', {there}): choose another folder with "
+                "--out"
             )
+        moved = f"the campaign was at {there} when this run was begun; what has not changed is not run again"
     write_json(path, {"format": RUN_FORMAT, "campaign": here, "name": campaign.name})
+    return moved
 
 
 def _run_stages(context: Context, until: str | None, start: str | None, only: Sequence[str] | None) -> Done:
@@ -197,12 +218,14 @@ def finish(run: Run, stage: str, key: str, outcome: Outcome, seconds: float) -> 
 def stage_key(stage: Stage, context: Context, applying: Sequence[str]) -> str:
     """Hash of everything that the result of a stage depends on."""
     run, campaign = context.run, context.campaign
-    files = {str(path): run.hash(path) for path in stage.inputs(campaign)}
+    home = campaign.path.parent.absolute()
+    files = {os.path.relpath(path.absolute(), home): run.hash(path) for path in stage.inputs(campaign)}
     upstream = {}
     for name in stage.after:
         record = run.record(name) if name in applying else None
         upstream[name] = dict(record.outputs) if record else None
-    alone = context.body if stage.name == "survey" else None
+    # the index of images holds their places; everything else is the same wherever the campaign lies
+    alone = context.body if stage.name == "survey" else str(home) if stage.name == "detect" else None
     return fingerprint(stage.name, files, stage.settings(campaign), upstream, code_version(*stage.code), alone)
 
 

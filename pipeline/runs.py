@@ -114,6 +114,13 @@ class Run:
         """log.txt"""
         return self.folder / "log.txt"
 
+    def contract_files(self) -> tuple[Path, ...]:
+        """The files that a run writes for others to read."""
+        return (
+            self.report, self.result, self.diagnosis, self.next_poses, self.robot, self.covariance, self.points,
+            self.frames, self.residuals, self.log,
+        )  # fmt: skip
+
     def body(self, name: str) -> Path:
         """bodies/<name>.yaml"""
         return self.folder / "bodies" / f"{_plain(name)}.yaml"

@@ -16,6 +16,9 @@ from pydantic_core import PydanticCustomError
 from pipeline.yaml_io import YamlDocument, read_yaml
 from robcal.errors import InvalidInput
 
+MAX_TEXT = 1000
+"""Characters of a name or path; longer ones are no names."""
+
 
 def _number(value: Any) -> Any:
     if isinstance(value, bool) or not isinstance(value, int | float):
@@ -54,6 +57,8 @@ def _text(value: Any) -> Any:
         return str(value)  # a name like 007 or 3 is text although YAML reads a number
     if not isinstance(value, str) or not value.strip():
         raise ValueError(f"must be text, found {shown(value)}")
+    if len(value) > MAX_TEXT or not value.isprintable():
+        raise ValueError(f"must be one line of at most {MAX_TEXT} printable characters, found {shown(value)}")
     return value
 
 

@@ -80,10 +80,7 @@ class Table:
         """
         self.require([name])
         cells = self.columns[name]
-        try:
-            values = np.array([float(cell) for cell in cells], dtype=float)
-        except ValueError:
-            values = np.array([_float_or_nan(cell) for cell in cells], dtype=float)
+        values = np.array([_float_or_nan(cell) for cell in cells], dtype=float)
         bad = ~np.isfinite(values)
         if bad.any():
             i = int(np.argmax(bad))
@@ -120,7 +117,8 @@ class Table:
 
 def _float_or_nan(cell: str) -> float:
     try:
-        return float(cell)
+        # float() takes the digit groups of Python source, 1_000, which no table means
+        return float(cell) if "_" not in cell else math.nan
     except ValueError:
         return math.nan
 

@@ -115,7 +115,13 @@ def read_yaml(path: Path) -> YamlDocument:
     except UnicodeDecodeError as error:
         line = raw[: error.start].count(b"\n") + 1
         raise InvalidInput(f"{path}, line {line}: not UTF-8 text: save the file as UTF-8") from None
-    loader = _Loader(text)
+    try:
+        loader = _Loader(text)
+    except yaml.reader.ReaderError as error:
+        line = text[: error.position].count("\n") + 1
+        raise InvalidInput(
+            f"{path}, line {line}: not a text file: it holds the control character #x{ord(text[error.position]):02x}"
+        ) from None
     try:
         node = loader.get_single_node()
         lines: dict[Location, int] = {}

@@ -77,7 +77,7 @@ def work(context: Context) -> Outcome:
     nominal = fit_nominal(robot, inputs.subset(rows), recording.select(rows))
     found, recording = identify_recording(robot, inputs, recording, rows, options, kernel)
     if recording.stated:
-        check_failed_fit(robot, poses, inputs, recording, kernel, found.sigma0)
+        check_failed_fit(robot, poses, inputs, recording, kernel, found)
     calibrated = calibrated_robot(poses, inputs, found, nominal.model)
     facts = {f.name: getattr(found, f.name) for f in fields(found) if f.name != "kernel"}
     outputs = [run.save(NAME, Identification(rows, facts, recording)), run.save(f"calibrated_{NAME}", calibrated)]

@@ -12,7 +12,8 @@ from pipeline.campaign import Campaign
 from pipeline.poses_table import Poses
 from pipeline.runs import Run
 from pipeline.stages.observations import RobotRecording, build_recording
-from robcal.calibration.observations import FrameObservations, PointObservations
+from robcal.calibration.identification import IdentifiedRobot
+from robcal.calibration.observations import DistanceObservations, FrameObservations, PointObservations
 from robcal.calibration.plausibility import SUSPICIOUS_SHARE, likely_causes
 from robcal.errors import InvalidInput, RobcalError
 from robcal.robot.kernel import Kernel, PoseInputs
@@ -21,6 +22,8 @@ from robcal.robot.model import RobotModel
 FAILED = 10.0
 """sigma0 of the stated uncertainty above which a fit counts as failed."""
 MOST_POSES = 300
+HOPELESS, HOPELESS_SHARE = 0.01, 0.02
+"""Miss (m, and as a share of the way of the tool) of an identified robot above which it is no robot's."""
 
 _REMEDIES = {
     "slipped_rows": "bring poses and measurements together again",
@@ -48,21 +51,32 @@ def check_joint_log(
 
 
 def check_failed_fit(
-    robot: RobotModel, poses: Poses, inputs: PoseInputs, recording: RobotRecording, kernel: Kernel, sigma0: float
+    robot: RobotModel, poses: Poses, inputs: PoseInputs, recording: RobotRecording, kernel: Kernel,
+    found: IdentifiedRobot,
 ) -> None:
     """Where even the identified robot misses by many sigmas, look for smaller slips (a sign of the last joint, say).
 
     Raises
     ------
-    InvalidInput : a fault that explains the miss was found; the message gives the proof and the remedy.
+    InvalidInput : a fault that explains the miss was found (the message gives the proof and the remedy), or the miss is
+        beyond anything that a robot does.
     """
-    if sigma0 < FAILED:
+    if found.sigma0 < FAILED:
         return
     rows = np.arange(min(len(inputs), MOST_POSES))
     few = replace(recording, observations=recording.select(rows))
     fault = _fault(robot, inputs.subset(rows), few, kernel, share=0.0)
     if fault:
         raise InvalidInput(f"{poses.path}: joint angles and measurements do not belong together: {fault}")
+    T = found.kernel.frames(found.full_theta, inputs)
+    miss = float(np.sqrt(np.mean(np.concatenate([o.evaluate(T)[0].ravel() ** 2 for o in recording.observations]))))
+    size = float(np.linalg.norm(np.std(T[:, :3, 3], axis=0)))
+    if miss > max(HOPELESS, HOPELESS_SHARE * size):
+        raise InvalidInput(
+            f"{poses.path}: even the identified robot misses the measurements by {1e3 * miss:.3g} mm RMS: joint "
+            "angles, robot file and measurements do not belong together, and no single slip (sign, unit, exchanged "
+            "columns, shifted rows) explains it: check which recording belongs to which"
+        )
 
 
 def check_joint_limits(campaign: Campaign, run: Run) -> None:
@@ -104,6 +118,8 @@ def _check_unit(poses: Poses, inputs: PoseInputs, recording: RobotRecording, ker
             measured = o.world_T_tool[:, :3, 3]
         elif isinstance(o, PointObservations):
             measured = o.p_world
+        elif isinstance(o, DistanceObservations):
+            measured = o.distance[:, None]
         else:
             continue
         way, robot_way = float(np.std(measured, axis=0).max()), float(np.std(moved[o.pose], axis=0).max())

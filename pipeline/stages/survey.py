@@ -18,7 +18,7 @@ from robcal.errors import DegenerateGeometry, InvalidInput, NotIdentifiable, Rob
 from robcal.photogrammetry.bodies import Body
 from robcal.photogrammetry.camera import INTRINSIC_NAMES
 from robcal.photogrammetry.colmap_engine import export_colmap
-from robcal.photogrammetry.network import CameraNetwork, Lengths
+from robcal.photogrammetry.network import Lengths
 from robcal.photogrammetry.survey import BodyTarget, SurveyImage, SurveyResult, survey_body
 
 NAME = "survey"
@@ -32,7 +32,7 @@ def work(context: Context) -> Outcome:
         if source.survey is None or source.survey_entry is None or (context.body and name != context.body):
             continue
         done = survey_one(campaign, run, name, source)
-        body = surveyed_body(name, source.file, done.network)
+        body = surveyed_body(name, source.file, done, _not_on_it(campaign, run, name, source))
         outputs += [run.save(f"survey_{name}", done), run.save(f"body_{name}", body)]
         outputs += _write(run, name, source.survey, body, done)
         notes += [f"survey of '{name}': {note}" for note in _notes(done)]
@@ -135,24 +135,54 @@ def size_of_marks(table: MarksTable) -> tuple[int, int]:
     return int(width), int(height)
 
 
-def surveyed_body(name: str, file: BodyFile, network: CameraNetwork) -> Body:
-    """The surveyed targets as a body. Targets that the file does not list (those of scale bars) are not on it."""
-    listed = {t.id: t for t in file.targets if t.id is not None}
+def _not_on_it(campaign: Campaign, run: Run, name: str, source: BodySource) -> frozenset[int]:
+    """Targets of scale bars that the body file lists without coordinates and that no station camera has ever seen.
+
+    A file may list the targets of scale bars (without coordinates): they were photographed with the body but are not on
+    it. A known distance between two of the body's own targets is stated in the same words; the station's images tell.
+    """
+    entry, station = source.survey_entry, campaign.entry.station
+    if entry is None or station is None or station.body != name:
+        return frozenset()
+    pairs = [*(bar.targets for bar in entry.scale_bars), *(length.targets for length in entry.check_lengths)]
+    ends = {number for pair in pairs for number in pair}
+    bare = ends & {t.id for t in source.file.targets if t.id is not None and t.xyz is None}
+    seen: set[int] = set()
+    if bare and any(camera.images for camera in campaign.cameras.values()):
+        index: DetectionIndex = run.load("detect")
+        for camera in campaign.cameras:
+            for found in load_detections(run, index, f"station/{camera}").values():
+                seen |= set(found.code.tolist())
+    for images in campaign.cameras.values():
+        if images.marks is not None:
+            seen |= set(images.marks.target.tolist())
+    return frozenset(bare - seen)
+
+
+def surveyed_body(name: str, file: BodyFile, done: SurveyResult, beside: frozenset[int] = frozenset()) -> Body:
+    """The surveyed targets as a body, without those ``beside`` it.
+
+    Targets that the file does not list (those of scale bars) are not on it either.
+    """
+    network = done.network
+    listed = {t.id: t for t in file.targets if t.id is not None and t.id not in beside}
     unlisted_dot = any(t.id is None for t in file.targets)
     rows = [i for i, t in enumerate(network.ids) if int(t) in listed or (unlisted_dot and int(t) >= 4096)]
     at = np.array([3 * i + k for i in rows for k in range(3)], dtype=np.intp)
     own = [listed.get(int(network.ids[i])) for i in rows]
     common = next((t.diameter for t in file.targets if t.id is None and t.diameter is not None), np.nan)
+    # what the file does not state was measured, where dots of stated size tell how large dots look
+    measured = np.where(network.radii[rows] > 0, 2.0 * network.radii[rows], np.nan)
+    stated = [common if t is None else np.nan if t.diameter is None else t.diameter for t in own]
     return Body(
         name=name,
         ids=np.array([network.ids[i] for i in rows], dtype=np.int64),
         points=network.points[rows],
         covariance=network.points_covariance[np.ix_(at, at)],
         codes=tuple(t.code if t is not None else None for t in own),
-        diameters=np.array(
-            [common if t is None else np.nan if t.diameter is None else t.diameter for t in own], dtype=float
-        ),
+        diameters=np.where(np.isfinite(stated), stated, measured),
         polarity=file.polarity,
+        normals=done.normals[rows] if np.isfinite(done.normals[rows]).any() else None,
     )
 
 
@@ -165,6 +195,7 @@ def _write(run: Run, name: str, source: ImageSource, body: Body, done: SurveyRes
         codes=body.codes,
         diameters=[None if not np.isfinite(d) else float(d) for d in body.diameters],
         polarity=body.polarity,
+        normals=body.normals,
         comment=f"surveyed: {done.frame}; {done.scale}",
     )
     sigma = np.sqrt(np.clip(np.diag(done.network.intrinsics_covariance), 0, None))

@@ -26,7 +26,10 @@ Array = NDArray[np.float64]
 SUSPICIOUS_SHARE = 0.01
 """Share of the size of the workspace that a nominal robot may miss before anything is suspected."""
 PROOF = 0.25
-"""A cause is likely if mending it lowers the miss below this share."""
+"""A cause is likely if mending it lowers the miss below this share, and to what nominal robots miss."""
+
+FEWEST_POSES = 8
+"""Fewer poses fit too many explanations."""
 
 _SIX = ("x", "y", "z", "roll", "pitch", "yaw")
 
@@ -96,6 +99,8 @@ def likely_causes(
         before, per_pose = np.inf, np.full(len(poses), np.inf)
     if share > 0 and before < max(2e-3, share * size):
         return []
+    if len(poses) < FEWEST_POSES:
+        return []
     found: list[LikelyCause] = []
     for kind, where, sentence, mended in _repairs(model, poses, per_pose, kernel, observations):
         try:
@@ -104,7 +109,8 @@ def likely_causes(
             after, _ = nominal_miss(kernel, new_poses, new_observations)
         except RobcalError:
             continue
-        if after < PROOF * before:
+        as_robots_do = max(2e-3, 2.0 * SUSPICIOUS_SHARE * _workspace(kernel, new_poses))
+        if after < min(PROOF * before, as_robots_do):
             proof = f"{sentence}: mending it lowers the miss of the nominal robot from {1e3 * before:.3g} mm to "
             found.append(LikelyCause(kind, where, f"{proof}{1e3 * after:.3g} mm", before, after))
     found.sort(key=lambda c: c.rms_after)

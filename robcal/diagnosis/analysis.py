@@ -13,7 +13,7 @@ from robcal.diagnosis.empirical import empirical_families
 from robcal.diagnosis.family_wise import FamilyWise, simulate
 from robcal.diagnosis.naming import Posterior, posterior
 from robcal.diagnosis.recording import Accepted, Fit, Recording
-from robcal.diagnosis.scan import Entry, ScanResult, Stack, orthonormal_basis, scan, stack_entries
+from robcal.diagnosis.scan import ScanResult, Stack, orthonormal_basis, restack, scan, stack_entries
 from robcal.physics.family import Array, Constants, Family
 from robcal.physics.library import all_families
 from robcal.physics.site import RobotSite
@@ -34,7 +34,6 @@ class Analysis:
     at: Tangents
     families: tuple[Family, ...]
     named: Array
-    entries: tuple[Entry, ...]
     basis: Array
     residual: Array
     stacks: tuple[Stack, ...]
@@ -76,52 +75,40 @@ def analyse(
     """Scan all candidates at a fit; `level` reuses a simulated family-wise level of the same design."""
     at = tangents(fit, recording)
     families = library_at(fit, recording, at, tied)
-    listed = tuple(entries(families, at))
     basis = orthonormal_basis(fit.jacobian)
-    return _look(fit, at, families, listed, basis, runs, level, recording)
+    return _look(fit, at, families, stack_entries(entries(families, at), basis), basis, runs, level)
 
 
 def extend(analysis: Analysis, columns: Array) -> Analysis:
     """The same look with further columns (m, c) fitted, to first order: what would be left after adding a cause."""
-    projected = columns - analysis.basis @ (analysis.basis.T @ columns)
-    basis = np.concatenate([analysis.basis, orthonormal_basis(projected)], axis=1)
-    return _look(
-        analysis.fit,
-        analysis.at,
-        analysis.families,
-        analysis.entries,
-        basis,
-        0,
-        analysis.family_wise,
-        analysis.at.recording,
-    )
+    further = orthonormal_basis(columns - analysis.basis @ (analysis.basis.T @ columns))
+    basis = np.concatenate([analysis.basis, further], axis=1)
+    stacks = restack(analysis.stacks, further)
+    return _look(analysis.fit, analysis.at, analysis.families, stacks, basis, 0, analysis.family_wise)
 
 
 def _look(
     fit: Fit,
     at: Tangents,
     families: Sequence[Family],
-    listed: Sequence[Entry],
+    stacks: tuple[Stack, ...],
     basis: Array,
     runs: int,
     level: FamilyWise | None,
-    recording: Recording,
 ) -> Analysis:
     residual = fit.residual - basis @ (basis.T @ fit.residual)
     redundancy = len(residual) - basis.shape[1]
-    stacks = stack_entries(listed, basis)
     result = scan(stacks, residual, redundancy)
     ranked = posterior(families, result)
     family_wise = level if level is not None else simulate(stacks, basis, redundancy, len(residual), runs=runs)
     p_value = family_wise.probability(float(result.log_p[result.best]))
     named = np.array([family.cause != "unknown" for family in families])
-    suspect = worst_group(residual, basis, recording.row_groups(len(residual)))
+    suspect = worst_group(residual, basis, at.recording.row_groups(len(residual)))
     return Analysis(
         fit,
         at,
         tuple(families),
         named,
-        tuple(listed),
         basis,
         residual,
         stacks,

@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from robcal.diagnosis.analysis import Analysis, analyse
+from robcal.diagnosis.curves import LEAST_POSES, Curves, find_curves, nested_errors
 from robcal.diagnosis.heldout import cross_validated, folds, noise_floor, position_errors, rms
 from robcal.diagnosis.naming import rivals, signature
 from robcal.diagnosis.next_poses import separating_poses
@@ -32,6 +33,8 @@ from robcal.robot.terms import identifier
 DEFAULTS = SelectionSettings()
 PLAUSIBLE_DEFLECTION = 3e-4
 """rad under the largest load, for elasticities."""
+MOST_BESIDE_CURVES = 4
+"""Causes that are looked for beside irregular curves of the joints: what these leave is small."""
 MOST_POSES = 200
 """Poses on which a search is done; the final fit takes all."""
 
@@ -65,14 +68,23 @@ def diagnose(
     verify = None if verify is None else relabelled(verify, swaps)
     thin = thinned(recording)
     noise = estimate_noise(model, thin, free)
+    curves, of_curves = _curves(model, recording, free, verify, tell)
     silent = frozenset(optional) & set(free)
-    chosen = select(model, noise.apply(thin), free, tied, settings, tell)
-    bare_model, bare = model, free
-    if chosen.accepted and silent:
-        bare_model = model.with_parameters(dict.fromkeys(silent, 0.0))
-        bare = tuple(name for name in free if name not in silent)
-        again = select(bare_model, noise.apply(thin), bare, tied, settings, tell)
-        if _information(again) < _information(chosen):
+    bare_model = model.with_parameters(dict.fromkeys(silent, 0.0)) if silent else model
+    bare = tuple(name for name in free if name not in silent)
+    if curves.accepted:
+        # While other causes are looked for, the curves stand as numbers: they follow from far more poses than a search
+        # has. They are an effect that was left out, so the search without the optional parameters is the one to do.
+        bare_model = bare_model.with_terms(curves.frozen)
+        noise = estimate_noise(bare_model, thin, bare)
+        settings = replace(settings, most=min(settings.most, MOST_BESIDE_CURVES))
+        chosen = select(bare_model, noise.apply(thin), bare, tied, settings, tell)
+    else:
+        chosen = select(model, noise.apply(thin), free, tied, settings, tell)
+        again = None
+        if chosen.accepted and silent:
+            again = select(bare_model, noise.apply(thin), bare, tied, settings, tell)
+        if again is not None and _information(again) < _information(chosen):
             chosen = again
         else:
             bare_model, bare = model, free
@@ -80,12 +92,17 @@ def diagnose(
         # the first estimate contained the effects
         noise = estimate_noise(bare_model, chosen.recording, bare, chosen.accepted)
     before = fit(model, chosen.recording, free)
-    final = chosen.last.fit
+    last = chosen.last
+    final = last.fit
     whole = chosen.recording
-    if thin is not recording:
-        whole = replace(recording, shared=None)
-        final = fit(bare_model, whole, chosen.free, chosen.accepted)
-    findings = (*exchanged, *_findings(bare_model, chosen, silent, verify, before))
+    if thin is not recording or curves.accepted:
+        # with all poses the scatter of the joints is known better than from those of the search
+        noise = estimate_noise(bare_model, recording, bare, chosen.accepted)
+        whole = noise.apply(recording)
+        everything = (*curves.accepted, *chosen.accepted)
+        final = fit(replace(bare_model, terms=model.terms), whole, chosen.free, everything)
+    found = _findings(bare_model, chosen, silent, verify, fit(bare_model, chosen.recording, bare))
+    findings = (*exchanged, *of_curves, *found)
     heldout = (
         _error(chosen.recording, before, verify),
         _error(whole, final, verify),
@@ -96,10 +113,9 @@ def diagnose(
     poses: tuple[dict[str, float], ...] = ()
     for finding in findings:
         if finding.rivals and not poses:
-            poses = separating_poses(final, chosen.recording, finding)
+            poses = separating_poses(last.fit, chosen.recording, finding)
     names = recording.names
     blunders = tuple(f"{names[row]}" for _, row in chosen.blunders)
-    last = chosen.last
     pattern = None
     if last.p_value <= settings.level:
         family = last.families[last.top(np.ones(len(last.families), dtype=bool))]
@@ -118,8 +134,49 @@ def diagnose(
         free=final.free,
         next_poses=poses,
         seconds=time.perf_counter() - start,
-        region=region_errors(chosen.recording, before, chosen.last.fit),
+        region=region_errors(whole, fit(model, whole, free), final) if curves.accepted
+        else region_errors(chosen.recording, before, last.fit),
     )
+
+
+def _curves(
+    model: RobotModel,
+    recording: Recording,
+    free: tuple[str, ...],
+    verify: Recording | None,
+    tell: Callable[[str], None],
+) -> tuple[Curves, tuple[Finding, ...]]:
+    """Error curves of the joints over their own angle, from all poses, and what is told about them."""
+    if len(recording.q) < LEAST_POSES:
+        return Curves(), ()
+    weighted = estimate_noise(model, recording, free).apply(recording)
+    present = fit(model, weighted, free)
+    curves = find_curves(present, weighted)
+    if not curves.accepted:
+        return curves, ()
+    tell(f"error curves of {', '.join(item.family.where for item in curves.accepted)}")
+    errors = nested_errors(present, weighted, curves.accepted, verify)
+    findings = []
+    for k, item in enumerate(curves.accepted):
+        family = item.family
+        told = family.report(item.values, item.constants)
+        statement = describe(family.sentence, family.where, family.direction, told)
+        for like in curves.likenesses:
+            if like.joint == family.where:
+                told["like"] = {
+                    "axis": like.other, "sense": like.sense, "turned_deg": float(np.degrees(like.shift)),
+                    "correlation": like.correlation, "overlap_deg": float(np.degrees(like.overlap)),
+                }  # fmt: skip
+                statement += f"; it is the curve of {like.other}{' reversed and' if like.sense < 0 else ''} turned by "
+                statement += f"{np.degrees(like.shift):.0f} deg (correlation {like.correlation:.2f})"
+        none = np.zeros((len(item.values), len(item.values)))
+        findings.append(
+            Finding(
+                family, item.constants, item.values, none, told, {}, curves.p_value, 0.0, (), curves.shares[k], (),
+                (errors[k], errors[k + 1]), statement,
+            )
+        )  # fmt: skip
+    return curves, tuple(findings)
 
 
 def _information(chosen: Selection) -> float:
@@ -201,7 +258,8 @@ def _findings(
         others = tuple(other for j, other in enumerate(final.accepted) if j != k)
         look = chosen.first
         if others:
-            look = analyse(fit(model, chosen.recording, chosen.free, others), chosen.recording, chosen.tied)
+            rest = fit(model, chosen.recording, chosen.free, others)
+            look = analyse(rest, chosen.recording, chosen.tied, level=chosen.first.family_wise)
         partial = fit(model, chosen.recording, chosen.free, final.accepted[: k + 1])
         after = _error(chosen.recording, partial, verify)
         findings.append(_finding(look, item, chosen.p_values[k], (error, after), chosen))

@@ -20,6 +20,9 @@ BUMPS = (4, 7, 12)
 EMPIRICAL_WEIGHT = 0.2
 """Prior weight of all empirical families together, against one for each named cause."""
 
+CURVE_PRIOR = 3e-4
+"""Typical amplitude of one bump of a joint's error curve, rad."""
+
 
 def empirical_families(site: RobotSite) -> Iterator[Family]:
     """Smooth laws in the joint's own angle, other angles, its torque, time, temperature and order; and products."""
@@ -142,3 +145,45 @@ def _bump(site: RobotSite, joint: Joint) -> Family:
         bases=bases,
         covariates=(f"q{k}",),
     )
+
+
+def periodic_curve(joint: Joint, angles: Array, bumps: int) -> Family:
+    """An irregular error of a joint that repeats every turn: bumps on the circle where the joint was (angles in rad).
+
+    The bumps are von Mises' (exp(cos)), so a joint at -90 deg and at 270 deg has the same error.
+    """
+    k = joint.number
+    spacing = 2.0 * np.pi / bumps
+    near = np.unique(np.round((angles % (2.0 * np.pi)) / spacing).astype(int) % bumps)
+    centres = [float(np.round(i * spacing, 9)) for i in near]
+    sharp = float(np.round(1.0 / (0.9 * spacing) ** 2, 6))
+
+    def bases(c: Constants) -> tuple[Basis, ...]:
+        return tuple(
+            Basis(joint.frame, "q", f"exp(sharp*(cos(q{k} - centre) - 1))", f"c{i}", {"sharp": sharp, "centre": x})
+            for i, x in zip(near, centres, strict=True)
+        )
+
+    return Family(
+        "unknown",
+        "robot",
+        joint.where,
+        _place(joint, "q"),
+        (),
+        (),
+        lambda v, c: {
+            "term": _term([f"q{k}"], "gaussian_process", _formula(bases(c), v)),
+            "period_deg": 360.0,
+            "rms_deg": float(np.degrees(np.std(_curve_values(bases(c), v, f"q{k}", angles)))),
+        },
+        "The angle of {where} is wrong by an irregular curve that repeats every turn ({rms_deg:.4f} deg RMS), as of an "
+        "encoder or gear with uneven pitch",
+        grid=({"bumps": float(bumps)},),
+        bases=bases,
+        covariates=(f"q{k}",),
+        default_prior=CURVE_PRIOR,
+    )
+
+
+def _curve_values(bases: tuple[Basis, ...], values: Array, name: str, angles: Array) -> Array:
+    return np.asarray(np.sum([v * b.value({name: angles}) for b, v in zip(bases, values, strict=True)], axis=0))

@@ -70,7 +70,8 @@ def cross_validated(recording: Recording, fitted: Fit, labels: Array) -> Array:
     predicted = np.empty(m)
     for fold in np.unique(labels):
         test = fold_of_row == fold
-        step = solve(fitted.jacobian[~test], fitted.residual[~test])
+        rows = np.vstack([fitted.jacobian[~test], fitted.prior])
+        step = solve(rows, np.concatenate([fitted.residual[~test], fitted.prior_residual]))
         predicted[test] = fitted.residual[test] - fitted.jacobian[test] @ step
     return recording.local(predicted[:, None], fitted.frames)[:, : min(per, 3), 0]
 

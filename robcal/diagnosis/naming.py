@@ -117,7 +117,7 @@ def _nearby(
     listed = [Entry(0, g, at.columns(family, trial) * family.sizes(trial)) for g, trial in enumerate(trials)]
     best, chosen = -np.inf, constants
     for stack in stack_entries(listed, fitted):
-        evidence = log_bayes_factor(stack.singular, np.einsum("emc,m->ec", stack.basis, residual))
+        evidence = log_bayes_factor(stack.singular, residual @ stack.basis)
         if float(evidence.max()) > best:
             best, chosen = float(evidence.max()), trials[int(stack.grid[int(np.argmax(evidence))])]
     return chosen
@@ -137,7 +137,7 @@ def overlap(stacks: Sequence[Stack], projected: Array, families: int) -> tuple[A
     if size == 0:
         return share, grid
     for stack in stacks:
-        part = np.sum(np.einsum("emc,m->ec", stack.basis, projected) ** 2, axis=1) / size
+        part = np.sum((projected @ stack.basis) ** 2, axis=1) / size
         for e in range(len(part)):
             if part[e] > share[stack.family[e]]:
                 share[stack.family[e]], grid[stack.family[e]] = part[e], stack.grid[e]

@@ -44,8 +44,8 @@ def separating_poses(
         )
         for r in rivals
     ]
-    normals = [np.einsum("nkp,nkq->pq", a, a) for a, _ in per_rival]
-    rights = [np.einsum("nkp,nk->p", a, own_here) for a, _ in per_rival]
+    normals = [np.tensordot(a, a, axes=((0, 1), (0, 1))) for a, _ in per_rival]
+    rights = [np.tensordot(a, own_here, axes=((0, 1), (0, 1))) for a, _ in per_rival]
     reached = np.zeros(len(rivals))
     taken: list[int] = []
     for _ in range(min(count, len(inputs))):
@@ -54,8 +54,8 @@ def separating_poses(
         normal = normals[weakest]
         ridge = 1e-12 * np.diag(np.diag(normal)) + 1e-18 * np.eye(len(normal))
         inverse = np.linalg.pinv(normal + ridge, rcond=1e-14, hermitian=True)
-        miss = own_there - np.einsum("nkp,p->nk", columns, inverse @ rights[weakest])
-        leverage = np.einsum("nkp,pq,nlq->nkl", columns, inverse, columns) + np.eye(6)
+        miss = own_there - columns @ (inverse @ rights[weakest])
+        leverage = (columns @ inverse) @ columns.swapaxes(1, 2) + np.eye(6)
         score = np.einsum("nk,nk->n", miss, np.linalg.solve(leverage, miss[:, :, None])[:, :, 0])
         score[taken] = -1.0
         best = int(np.argmax(score))

@@ -25,6 +25,12 @@ from robcal.transforms import transform
 
 UNDETERMINED = 1e-6
 """Directions of the scaled Jacobian below this share of the largest stay as they are: their sigma would be a radian."""
+MOST_FREE = 12
+"""A law with more amplitudes than these is a Gaussian process: its prior goes into the fit."""
+TERM_PARTS = 24
+"""Amplitudes in one expression of the kernel, which may not grow without end."""
+MANY = 120
+"""Parameters from which normal equations replace the singular values of the Jacobian."""
 SpatialObservations = FrameObservations | PointObservations | DistanceObservations | SensorPointObservations
 
 
@@ -187,6 +193,7 @@ class Fit:
     residual : (m,) whitened, measured - model. jacobian : (m, p) whitened.
     row_pose : (m,) pose of each row. inputs, frames : poses and modelled frames of the tool.
     covariance : (p, p) of the free parameters and the amplitudes of observation causes, variance factor one.
+    prior, prior_residual : (k, p) and (k,) rows of what is expected of amplitudes, in the units of the residuals.
     common : (k,) errors common to all poses as estimated, in their standard deviations (`Recording.common`).
     """
 
@@ -201,6 +208,8 @@ class Fit:
     inputs: PoseInputs
     frames: Array
     covariance: Array
+    prior: Array
+    prior_residual: Array
     common: Array | None = None
 
     @property
@@ -247,16 +256,21 @@ def terms_of(accepted: Accepted, number: int) -> tuple[Term, ...]:
     groups: dict[tuple[str, str], list[tuple[str, str]]] = {}
     for basis in family.bases(accepted.constants):
         groups.setdefault((basis.frame, basis.kind), []).append((basis.parameter, basis.expression))
+    sizes: dict[str, float] = {}
+    if len(accepted.names) > MOST_FREE:
+        sizes = dict(zip(accepted.names, map(float, family.sizes(accepted.constants)), strict=True))
     return tuple(
         Term(
             name,
             frame,
             kind,
-            " + ".join(f"{p}*({expression})" for p, expression in parts),
-            {p: values[p] for p, _ in parts},
+            " + ".join(f"{p}*({expression})" for p, expression in parts[k : k + TERM_PARTS]),
+            {p: values[p] for p, _ in parts[k : k + TERM_PARTS]},
+            priors={p: sizes[p] for p, _ in parts[k : k + TERM_PARTS] if p in sizes},
             cause=family.cause,
         )
         for (frame, kind), parts in groups.items()
+        for k in range(0, len(parts), TERM_PARTS)
     )
 
 
@@ -294,13 +308,25 @@ def fit(
             jacobian = np.concatenate([jacobian, *(recording.whiten(shift, frames) for shift in shifts)], axis=1)
         return frames, residual, jacobian
 
-    brake = np.diag(largest_steps(names, len(names) + sum(len(item.names) for item in direct)))[: len(names)]
-    previous = np.inf
+    width = len(names) + sum(len(item.names) for item in direct)
+    brake = np.diag(largest_steps(names, width))[: len(names)]
+    sizes = {f"{term.name}.{short}": size for term in model.terms for short, size in term.priors.items()}
+    held = np.array([k for k, name in enumerate(names) if name in sizes], dtype=np.intp)
+    prior = np.zeros((len(held), width))
+    previous, scale = np.inf, 0.0
     for _ in range(iterations):
         _, residual, jacobian = linearised()
+        if len(held):
+            # a prior weighs against observations of the variance that they show
+            scale = scale or float(np.sqrt(residual @ residual / len(residual)))
+            prior[np.arange(len(held)), held] = [scale / sizes[names[k]] for k in held]
         # steps are damped by the size that deviations can have: near-parallel axes leave directions that a full
         # step would follow beyond all linearity
-        step = solve(np.vstack([jacobian, brake]), np.concatenate([residual, np.zeros(len(brake))]))[: len(columns)]
+        rows = np.concatenate([residual, np.zeros(len(brake)), -prior[:, held] @ theta[columns[held]]])
+        step = solve(np.vstack([jacobian, brake, prior]), rows)[: len(columns)]
+        if len(held):
+            left = residual - jacobian[:, : len(columns)] @ step
+            scale = float(np.sqrt(left @ left / max(len(left) - width, 1)))
         theta[columns] += step
         change = float(np.sum((jacobian[:, : len(columns)] @ step) ** 2))
         if change < 1e-10 or abs(previous - change) < 1e-14:
@@ -310,7 +336,7 @@ def fit(
     # displacements of observations are linear: their amplitudes follow from the last linear problem
     linear = solve(jacobian, residual)[len(columns) :] if direct else np.zeros(0)
     residual = residual - jacobian[:, len(columns) :] @ linear
-    covariance = pseudo_covariance(jacobian)
+    covariance = pseudo_covariance(np.vstack([jacobian, prior]))
     filled = model.with_parameters({name: float(theta[position[name]]) for name in names})
     done = _amplitudes(accepted, direct, names, position, theta, linear, covariance, len(columns))
     return Fit(
@@ -325,6 +351,8 @@ def fit(
         inputs,
         frames,
         covariance,
+        prior,
+        -prior[:, : len(columns)] @ theta[columns],
         recording.common_errors(residual),
     )
 
@@ -374,7 +402,11 @@ def solve(jacobian: Array, residual: Array) -> Array:
     """Minimum-norm least-squares step, columns scaled to unit length first."""
     size = np.linalg.norm(jacobian, axis=0)
     safe = np.where(size > 0, size, 1.0)
-    return np.asarray(np.linalg.lstsq(jacobian / safe, residual, rcond=UNDETERMINED)[0] / safe)
+    scaled = jacobian / safe
+    if jacobian.shape[1] > MANY:
+        gram = scaled.T @ scaled + UNDETERMINED**2 * np.eye(jacobian.shape[1])
+        return np.asarray(np.linalg.solve(gram, scaled.T @ residual) / safe)
+    return np.asarray(np.linalg.lstsq(scaled, residual, rcond=UNDETERMINED)[0] / safe)
 
 
 def pseudo_covariance(jacobian: Array) -> Array:
@@ -384,7 +416,10 @@ def pseudo_covariance(jacobian: Array) -> Array:
     """
     size = np.linalg.norm(jacobian, axis=0)
     safe = np.where(size > 0, size, 1.0)
-    _, singular, right = np.linalg.svd(jacobian / safe, full_matrices=False)
+    scaled = jacobian / safe
+    if jacobian.shape[1] > MANY:  # the triangular factor has the same singular values
+        scaled = np.asarray(np.linalg.qr(scaled, mode="r"))
+    _, singular, right = np.linalg.svd(scaled, full_matrices=False)
     seen = singular > UNDETERMINED * singular.max(initial=0.0)
     root = (right[seen].T / singular[seen]) / safe[:, None]
     return root @ root.T

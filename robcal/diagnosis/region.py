@@ -34,9 +34,8 @@ def extrapolated(recording: Recording, fitted: Fit, region: Array) -> float:
     test = region[fitted.row_pose]
     per = len(fitted.residual) // len(recording.observations.pose)
     damping = np.diag(largest_steps(fitted.free, fitted.jacobian.shape[1]))
-    step = solve(
-        np.vstack([fitted.jacobian[~test], damping]), np.concatenate([fitted.residual[~test], np.zeros(len(damping))])
-    )
+    rows = np.vstack([fitted.jacobian[~test], damping, fitted.prior])
+    step = solve(rows, np.concatenate([fitted.residual[~test], np.zeros(len(damping)), fitted.prior_residual]))
     predicted = np.where(test, fitted.residual - fitted.jacobian @ step, 0.0)
     errors = recording.unwhiten(predicted[:, None], fitted.frames)[:, : min(per, 3), 0]
     return rms(errors[region[recording.observations.pose]])

@@ -10,7 +10,7 @@ whose amplitudes have the prior as standard deviation, averaged over four sizes 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import special, stats
@@ -110,39 +110,47 @@ def stack_entries(entries: Sequence[Entry], fitted: Fitted) -> tuple[Stack, ...]
     stacks = []
     for width in sorted({entry.columns.shape[1] for entry in entries}):
         group = [entry for entry in entries if entry.columns.shape[1] == width]
-        columns = np.stack([entry.columns for entry in group])
-        m = columns.shape[1]
-        flat = columns.transpose(1, 0, 2).reshape(m, -1)
-        norms = np.linalg.norm(flat, axis=0)
-        flat = remove(fitted, flat)
-        # a column that vanishes against its own size is rounding noise
-        flat[:, np.linalg.norm(flat, axis=0) < 1e-7 * norms] = 0.0
-        projected = np.ascontiguousarray(flat.reshape(m, len(group), width).transpose(1, 0, 2))
-        if width == 1:
-            singular = np.linalg.norm(projected, axis=1)
-            basis = projected / np.where(singular > 0, singular, 1.0)[:, None, :]
-            right = np.ones((len(group), 1, 1))
-        else:
-            gram = np.swapaxes(projected, 1, 2) @ projected
-            values, vectors = np.linalg.eigh(gram)
-            singular = np.sqrt(np.clip(values[:, ::-1], 0.0, None))
-            vectors = vectors[:, :, ::-1]
-            right = np.swapaxes(vectors, 1, 2)
-            basis = projected @ (vectors / np.where(singular > 0, singular, 1.0)[:, None, :])
-        seen = (singular > LEAST_SIGNAL) & (singular > 1e-5 * singular.max(axis=1, keepdims=True, initial=0.0))
-        basis = basis * seen[:, None, :]
-        stacks.append(
-            Stack(
-                np.array([entry.family for entry in group]),
-                np.array([entry.grid for entry in group]),
-                basis,
-                singular * seen,
-                right,
-                seen.sum(axis=1),
-                np.array([entry.positive for entry in group]),
-            )
-        )
+        projected = _projected(np.stack([entry.columns for entry in group]), fitted)
+        family, grid = (np.array([getattr(entry, name) for entry in group]) for name in ("family", "grid"))
+        stacks.append(_orthonormalised(projected, family, grid, np.array([entry.positive for entry in group])))
     return tuple(stacks)
+
+
+def restack(stacks: Sequence[Stack], further: Array) -> tuple[Stack, ...]:
+    """The stacks with further orthonormal columns (m, k) projected out, which are orthogonal to what was before."""
+    again = []
+    for stack in stacks:
+        projected = _projected(stack.basis * stack.singular[:, None, :], further)
+        new = _orthonormalised(projected, stack.family, stack.grid, stack.positive)
+        again.append(replace(new, right=new.right @ stack.right))
+    return tuple(again)
+
+
+def _projected(columns: Array, fitted: Fitted) -> Array:
+    """Columns (e, m, c) without what the model absorbs."""
+    e, m, c = columns.shape
+    flat = columns.transpose(1, 0, 2).reshape(m, -1)
+    norms = np.linalg.norm(flat, axis=0)
+    flat = remove(fitted, flat)
+    # a column that vanishes against its own size is rounding noise
+    flat[:, np.linalg.norm(flat, axis=0) < 1e-7 * norms] = 0.0
+    return np.ascontiguousarray(flat.reshape(m, e, c).transpose(1, 0, 2))
+
+
+def _orthonormalised(projected: Array, family: Array, grid: Array, positive: Array) -> Stack:
+    if projected.shape[2] == 1:
+        singular = np.linalg.norm(projected, axis=1)
+        right = np.ones((len(projected), 1, 1))
+        basis = projected / np.where(singular > 0, singular, 1.0)[:, None, :]
+    else:
+        values, vectors = np.linalg.eigh(np.swapaxes(projected, 1, 2) @ projected)
+        singular = np.sqrt(np.clip(values[:, ::-1], 0.0, None))
+        vectors = vectors[:, :, ::-1]
+        right = np.swapaxes(vectors, 1, 2)
+        basis = projected @ (vectors / np.where(singular > 0, singular, 1.0)[:, None, :])
+    seen = (singular > LEAST_SIGNAL) & (singular > 1e-5 * singular.max(axis=1, keepdims=True, initial=0.0))
+    basis *= seen[:, None, :]
+    return Stack(family, grid, basis, singular * seen, right, seen.sum(axis=1), positive)
 
 
 def log_bayes_factor(singular: Array, z: Array, positive: Array | None = None) -> Array:
@@ -167,7 +175,7 @@ def scan(stacks: Sequence[Stack], residual: Array, redundancy: int) -> ScanResul
 
     Weakness: one variance factor for all rows; rows must be whitened with covariances right up to that factor.
     """
-    scores = [np.einsum("emc,m->ec", stack.basis, residual) for stack in stacks]
+    scores = [residual @ stack.basis for stack in stacks]
     raw = np.concatenate([np.sum(z**2, axis=1) for z in scores])
     family = np.concatenate([stack.family for stack in stacks])
     grid = np.concatenate([stack.grid for stack in stacks])

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from robcal.diagnosis.analysis import Analysis, accepted_from, analyse, extend
+from robcal.diagnosis.family_wise import FamilyWise
 from robcal.diagnosis.naming import refine
 from robcal.diagnosis.recording import Accepted, Fit, Recording, fit
 from robcal.diagnosis.scan import orthonormal_basis
@@ -120,7 +121,9 @@ def select(
         if settled or len(accepted) < 2:
             break
         settled = True
-        changed, accepted, p_values = _backward(model, recording, free, tied, present, p_values, settings)
+        changed, accepted, p_values = _backward(
+            model, recording, free, tied, present, p_values, settings, first.family_wise
+        )
         if not changed:
             break
         present = fit(model, recording, free, accepted)
@@ -212,6 +215,7 @@ def _backward(
     present: Fit,
     p_values: list[float],
     settings: SelectionSettings,
+    level: FamilyWise,
 ) -> tuple[bool, tuple[Accepted, ...], list[float]]:
     """With all others in the model: is each cause still needed, and is its name still the best?"""
     accepted = list(present.accepted)
@@ -220,7 +224,7 @@ def _backward(
     k = 0
     while k < len(accepted) and len(accepted) > 1:
         others = tuple(accepted[:k] + accepted[k + 1 :])
-        look = analyse(fit(model, recording, free, others), recording, tied, runs=settings.runs)
+        look = analyse(fit(model, recording, free, others), recording, tied, level=level)
         if look.p_value > settings.level:
             accepted = list(look.fit.accepted)
             del probabilities[k]

@@ -48,7 +48,7 @@ def centre_bound(
         axes = second
     shape = np.concatenate([[phase], matrix_from_axes(axes, turn), [[np.log(s)]]], axis=1)
     profile, by_shape = spot(shape, x, y) if small else blurred_ellipse(shape, x, y)
-    columns = by_shape[0] * contrast
+    columns = by_shape[0].T * contrast
     if small:
         columns = columns[:, :5]  # size and blur are one
     everything = np.column_stack([columns, profile[0], np.ones(profile.shape[1])])

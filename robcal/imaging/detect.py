@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from robcal.errors import InvalidInput
 from robcal.imaging.aruco_markers import find_markers
-from robcal.imaging.blobs import step_all_around
+from robcal.imaging.blobs import Candidates, step_all_around
 from robcal.imaging.coarse_dots import with_coarse_dots
 from robcal.imaging.detections import CodeState, Detections, Reason, RejectionLog, TargetKind, empty_columns
-from robcal.imaging.dot_fitting import FittedDots, blur_without_pixel, fit_dots, refit_coded
+from robcal.imaging.dot_fitting import FittedDots, blur_without_pixel, fit_dots, refit_ringed
 from robcal.imaging.noise import NoiseModel, estimate_noise
 from robcal.imaging.ring_code import RingReadings, read_rings
 from robcal.imaging.segmentation import find_candidates
@@ -24,6 +24,7 @@ Array = NDArray[np.float64]
 _DEFAULT = DetectionSettings()
 _ODD = (Reason.SHAPE, Reason.STRUCTURE, Reason.NO_CONVERGENCE, Reason.OVER_CAP)
 _CODED_MISFIT_MAX = 0.1
+_STEP_BY_CONTRAST = 0.4  # least step across the outline by the least contrast; small dots are all edge
 
 
 def detect_targets(image: NDArray, settings: DetectionSettings = _DEFAULT) -> Detections:
@@ -55,9 +56,7 @@ def detect_targets(image: NDArray, settings: DetectionSettings = _DEFAULT) -> De
     bright, bright_noise = _bright(image, noise, settings)
     saturation = _saturation(bright, settings)
     candidates = find_candidates(bright, bright_noise, settings, log)
-    around = step_all_around(bright, candidates)
-    log.add_rows(candidates.xy[~around], candidates.semi_axes[~around, 0], Reason.SHAPE)
-    candidates = candidates.take(around)
+    candidates = _standing_out(bright, candidates, bright_noise, settings, log)
     late = may_be_ring_parts(candidates) if settings.ring12 else np.zeros(len(candidates), bool)
     dots, bright_noise, _ = fit_dots(bright, candidates.take(~late), bright_noise, saturation, settings.max_misfit)
     log.count(Reason.SHAPE, int((~late).sum()) - len(dots))
@@ -126,6 +125,18 @@ def _saturation(bright: NDArray, settings: DetectionSettings) -> float:
     return saturation_level(bright) if settings.saturation_level is None else settings.saturation_level
 
 
+def _standing_out(
+    bright: NDArray, candidates: Candidates, noise: NoiseModel, settings: DetectionSettings, log: RejectionLog
+) -> Candidates:
+    """The candidates whose outline shows a step all around, large enough for the contrast asked for."""
+    step, around = step_all_around(bright, candidates)
+    # noise on a brighter patch of texture stands high above the coarse background, but not above its surroundings
+    high = step > _STEP_BY_CONTRAST * settings.min_contrast_sigma * np.sqrt(noise.at(candidates.base))
+    for bad, reason in ((~around, Reason.SHAPE), (around & ~high, Reason.CONTRAST)):
+        log.add_rows(candidates.xy[bad], candidates.semi_axes[bad, 0], reason)
+    return candidates.take(around & high)
+
+
 def saturation_level(image: NDArray) -> float:
     """Grey value at which the image is cut off, infinity if none: the top of the range, or a plateau below it."""
     top, high = int(np.iinfo(image.dtype).max), int(image.max())
@@ -140,13 +151,13 @@ def saturation_level(image: NDArray) -> float:
 def _read(
     image: NDArray, dots: FittedDots, noise: NoiseModel, saturation: float, settings: DetectionSettings
 ) -> tuple[RingReadings, FittedDots]:
-    """Readings of all dots; those with a code are fitted again without their ring's glare."""
+    """Readings of all dots; those with a ring, read or not, are fitted again without its glare."""
     readings = _readings(image, dots, noise, saturation, settings)
-    coded = np.flatnonzero(readings.code >= 0)
-    if coded.size:
-        again = refit_coded(image, dots, readings, coded, noise, saturation)
-        good = again.converged & (np.linalg.norm(again.xy - dots.xy[coded], axis=1) < 0.5) & ~again.is_spot
-        dots = dots.replaced(coded[good], again.take(good))
+    ringed = np.flatnonzero((readings.code >= 0) | (readings.evidence & readings.bits.any(axis=1)))
+    if ringed.size:
+        again = refit_ringed(image, dots, readings, ringed, noise, saturation)
+        good = again.converged & (np.linalg.norm(again.xy - dots.xy[ringed], axis=1) < 0.5) & ~again.is_spot
+        dots = dots.replaced(ringed[good], again.take(good))
     return readings, dots
 
 

@@ -5,6 +5,9 @@ step profile E of :mod:`robcal.imaging.edge_model`. x, y in the linear terms cou
 the dot's radius. The gain gradient costs precision (it looks like a shift of the edge), so it carries a
 normal prior of zero mean whose variance is estimated from all dots of the image (empirical Bayes): no shading, no
 cost; shading, no bias. Saturated pixels are censored: they only say that the value is at least the saturation level.
+
+Pixels are in single precision, parameters and their normal equations in double. Centres cx, cy count from the origin of
+the fit's window.
 """
 
 from __future__ import annotations
@@ -24,6 +27,8 @@ PARAMETERS = SHAPE_PARAMETERS + 6  # b0, b1, b2, g0, g1, g2
 _LN_BLUR_SIGMA = 1.0  # weak prior on ln s: keeps dots of two pixels from an edge sharper or softer than can be
 _OUTLIER_SIGMA = 6.0
 _SHADING_SIGMA_MIN = 1e-3  # per radius; keeps the prior finite
+_SINGULAR = 1e-7  # smallest eigenvalue of a scaled normal matrix summed in single precision
+_COST_DIGITS = 2e-6  # relative accuracy of a cost summed in single precision
 
 
 @dataclass(frozen=True)
@@ -64,38 +69,50 @@ class EllipseFits:
         """(n, 12, 12) inverse of the normal matrices; infinite centre variances where they are singular."""
         scale = 1.0 / np.sqrt(np.maximum(np.diagonal(self.normal, axis1=1, axis2=2), 1e-100))
         scaled = self.normal * scale[:, :, None] * scale[:, None, :]
-        values, vectors = np.linalg.eigh(scaled)
-        singular = values[:, 0] < 1e-12
-        inverse = np.einsum("nij,nj,nkj->nik", vectors, 1.0 / np.maximum(values, 1e-12), vectors)
+        scaled[:, np.arange(PARAMETERS), np.arange(PARAMETERS)] += 1e-13
+        inverse = np.linalg.inv(scaled)
+        # the largest variance of a scaled parameter is the inverse of the smallest eigenvalue, nearly
+        variance = np.diagonal(inverse, axis1=1, axis2=2)
+        singular = ~((variance > 0.0) & (variance < 1.0 / _SINGULAR)).all(axis=1)
         inverse *= scale[:, :, None] * scale[:, None, :]
         inverse[singular] = np.diag(np.full(PARAMETERS, np.inf))
-        return inverse
+        return np.asarray(inverse, dtype=np.float64)
 
 
-def evaluate(parameters: Array, windows: Windows, is_spot: NDArray[np.bool_]) -> tuple[Array, Array]:
-    """Model grey values (n, p) and their derivatives (n, p, 12)."""
-    shape = parameters[:, :SHAPE_PARAMETERS]
-    profile, by_shape = blurred_ellipse(shape, windows.x, windows.y)
-    if is_spot.any():
-        profile[is_spot], by_shape[is_spot] = spot(shape[is_spot], windows.x[is_spot], windows.y[is_spot])
-    x, y = windows.u, windows.v
-    b0, b1, b2, g0, g1, g2 = (parameters[:, SHAPE_PARAMETERS + k, None] for k in range(6))
+def evaluate(
+    parameters: Array, windows: Windows, is_spot: NDArray[np.bool_], out: Array | None = None
+) -> tuple[Array, Array]:
+    """Model grey values (n, p) and their derivatives (n, 12, p); `out` (n, >= 12, p) takes the derivatives."""
+    shape, x, y = parameters[:, :SHAPE_PARAMETERS], windows.u, windows.v
+    jacobian = np.empty((len(x), PARAMETERS, x.shape[1]), x.dtype) if out is None else out[:, :PARAMETERS]
+    by_shape = jacobian[:, :SHAPE_PARAMETERS]
+    if is_spot.all():
+        profile, _ = spot(shape, windows.x, windows.y, by_shape)
+    else:
+        profile, _ = blurred_ellipse(shape, windows.x, windows.y, by_shape)
+        if is_spot.any():
+            profile[is_spot], by_shape[is_spot] = spot(shape[is_spot], windows.x[is_spot], windows.y[is_spot])
+    b0, b1, b2, g0, g1, g2 = _linear(parameters, x)
     gain = g0 + g1 * x + g2 * y
-    jacobian = np.empty((*x.shape, PARAMETERS))
-    np.multiply(by_shape, gain[..., None], out=jacobian[..., :SHAPE_PARAMETERS])
-    jacobian[..., 6] = 1.0
-    jacobian[..., 7] = x
-    jacobian[..., 8] = y
-    jacobian[..., 9] = profile
-    jacobian[..., 10] = profile * x
-    jacobian[..., 11] = profile * y
+    by_shape *= gain[:, None]
+    jacobian[:, 6] = 1.0
+    jacobian[:, 7] = x
+    jacobian[:, 8] = y
+    jacobian[:, 9] = profile
+    np.multiply(profile, x, out=jacobian[:, 10])
+    np.multiply(profile, y, out=jacobian[:, 11])
     return b0 + b1 * x + b2 * y + gain * profile, jacobian
+
+
+def _linear(parameters: Array, like: Array) -> list[Array]:
+    typed = parameters.astype(like.dtype, copy=False)
+    return [typed[:, SHAPE_PARAMETERS + k, None] for k in range(6)]
 
 
 def grey_values(parameters: Array, windows: Windows, is_spot: NDArray[np.bool_]) -> Array:
     """Model grey values (n, p)."""
     profile = profile_only(parameters[:, :SHAPE_PARAMETERS], windows.x, windows.y, is_spot)
-    b0, b1, b2, g0, g1, g2 = (parameters[:, SHAPE_PARAMETERS + k, None] for k in range(6))
+    b0, b1, b2, g0, g1, g2 = _linear(parameters, windows.u)
     return b0 + b1 * windows.u + b2 * windows.v + (g0 + g1 * windows.u + g2 * windows.v) * profile
 
 
@@ -105,7 +122,7 @@ def start(shape: Array, base: Array, peak: Array, windows: Windows, is_spot: NDA
     parameters = np.zeros((n, PARAMETERS))
     parameters[:, :SHAPE_PARAMETERS] = shape
     parameters[:, 6], parameters[:, 9] = base, peak - base
-    zeros = np.zeros(windows.x.shape)
+    zeros = np.zeros_like(windows.x)
     return EllipseFits(
         parameters, np.zeros((n, PARAMETERS, PARAMETERS)), np.full(n, np.inf), np.zeros(n, bool), is_spot, zeros, zeros,
         np.zeros(n),
@@ -117,35 +134,52 @@ class _System:
     normal: Array
     right: Array
     cost: Array
-    weight: Array
     residual: Array
 
+    def put(self, rows: NDArray, other: _System, chosen: NDArray[np.bool_]) -> None:
+        """The `chosen` rows of another system into `rows`."""
+        self.normal[rows], self.right[rows] = other.normal[chosen], other.right[chosen]
+        self.cost[rows], self.residual[rows] = other.cost[chosen], other.residual[chosen]
 
-def _system(parameters: Array, prior_blur: Array, windows: Windows, fits: EllipseFits, precision: Array) -> _System:
-    """Normal equations with priors at the given parameters; `precision` (n, p) of the pixels, 0 if left out."""
-    model, jacobian = evaluate(parameters, windows, fits.is_spot)
-    residual = windows.value - model
-    # censored: a saturated pixel below whose level the model stays is a residual, above it none
-    weight = np.where(windows.saturated & (residual < 0), 0.0, precision)
-    weighted = jacobian * weight[..., None]
-    normal = np.matmul(weighted.transpose(0, 2, 1), jacobian)
-    right = np.einsum("npk,np->nk", weighted, residual)
-    cost = np.einsum("np,np,np->n", weight, residual, residual)
+
+def _system(
+    parameters: Array, prior_blur: Array, windows: Windows, is_spot: NDArray[np.bool_], shading_sigma: Array,
+    precision: Array, buffers: tuple[Array, Array],
+) -> _System:  # fmt: skip
+    """Normal equations with priors at the given parameters.
+
+    `precision` (n, p) of the pixels, 0 if left out; `buffers` two arrays (>= n, 13, p) for the derivatives.
+    """
+    n = len(parameters)
+    columns, weighted = (buffer[:n] for buffer in buffers)
+    # a step into nowhere exceeds single precision; it is not taken, its cost is no number
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        model, _ = evaluate(parameters, windows, is_spot, columns)
+        residual = np.subtract(windows.value, model, out=columns[:, PARAMETERS])
+        np.multiply(columns, _weight(precision, windows, residual)[:, None], out=weighted)
+        products = np.matmul(weighted, columns.transpose(0, 2, 1)).astype(np.float64)
+    normal = 0.5 * (products[:, :PARAMETERS, :PARAMETERS] + products[:, :PARAMETERS, :PARAMETERS].transpose(0, 2, 1))
+    right, cost = products[:, :PARAMETERS, PARAMETERS].copy(), products[:, PARAMETERS, PARAMETERS].copy()
     # priors
     blur_precision = 1.0 / _LN_BLUR_SIGMA**2
     offset = prior_blur - parameters[:, 5]
     normal[:, 5, 5] += blur_precision
     right[:, 5] += blur_precision * offset
-    cost = cost + blur_precision * offset**2
+    cost += blur_precision * offset**2
     contrast = np.abs(parameters[:, 9])
-    sigma = np.maximum(fits.shading_sigma, _SHADING_SIGMA_MIN) * np.maximum(contrast, 1e-3)
+    sigma = np.maximum(shading_sigma, _SHADING_SIGMA_MIN) * np.maximum(contrast, 1e-3)
     for k in (10, 11):
         normal[:, k, k] += 1.0 / sigma**2
         right[:, k] -= parameters[:, k] / sigma**2
-        cost = cost + (parameters[:, k] / sigma) ** 2
+        cost += (parameters[:, k] / sigma) ** 2
     # a contrast that only censored pixels know stays finite
     normal[:, 9, 9] += 1e-4 / np.maximum(contrast, 1.0) ** 2
-    return _System(normal, right, cost, weight, residual)
+    return _System(normal, right, cost, residual.copy())
+
+
+def _weight(precision: Array, windows: Windows, residual: Array) -> Array:
+    """Precision (n, p) without censored pixels: a saturated pixel above whose level the model is fits."""
+    return np.where(windows.saturated & (residual < 0), np.float32(0.0), precision) if windows.censored else precision
 
 
 def iterate(
@@ -162,53 +196,60 @@ def iterate(
     n = len(fits.parameters)
     if n == 0:
         return fits
-    dropped = np.zeros(windows.valid.shape, bool) if dropped is None else dropped
+    used = windows.valid if dropped is None else windows.valid & ~dropped
     prior = fits.parameters[:, 5].copy() if prior_blur is None else prior_blur
-    parameters = fits.parameters.copy()
+    parameters, is_spot, shading = fits.parameters.copy(), fits.is_spot, fits.shading_sigma
     # weights from the model at the start of the call: within one call the cost is one function
-    precision = np.where(windows.valid & ~dropped, 1.0 / noise.at(grey_values(parameters, windows, fits.is_spot)), 0.0)
-    system = _system(parameters, prior, windows, fits, precision)
-    normal, right, cost = system.normal.copy(), system.right.copy(), system.cost.copy()
-    weight, residual = system.weight.copy(), system.residual.copy()
+    model = grey_values(parameters, windows, is_spot)
+    precision = (used / noise.at(model)).astype(model.dtype, copy=False)
+    size = (n, PARAMETERS + 1, windows.x.shape[1])
+    buffers = (np.empty(size, precision.dtype), np.empty(size, precision.dtype))
+    best = _system(parameters, prior, windows, is_spot, shading, precision, buffers)
+    pixels = np.maximum(used.sum(axis=1), 1)
     damping = np.full(n, 1e-4)
     converged = np.zeros(n, bool)
     active = np.arange(n)
+    sub, sub_precision = windows, precision
     for _ in range(steps):
-        step = _solve(normal[active], right[active], damping[active], fits.is_spot[active])
-        # a step is never larger than a part of the dot
-        size = windows.radius[active] + 1.0
-        factor = np.minimum(1.0, 0.3 * size / np.maximum(np.hypot(step[:, 0], step[:, 1]), 1e-12))
-        factor = np.minimum(factor, 0.7 / np.maximum(np.abs(step[:, 5]), 1e-12))
-        b_norm = np.abs(parameters[active, 2]) + np.abs(parameters[active, 4])
-        factor = np.minimum(factor, 0.4 * b_norm / np.maximum(np.abs(step[:, 2:5]).sum(axis=1), 1e-12))
-        step *= factor[:, None]
-        trial = parameters[active] + step
+        now = parameters[active]
+        step = _limited(_solve(best.normal[active], best.right[active], damping[active], is_spot[active]), now,
+                        windows.radius[active])  # fmt: skip
+        trial = now + step
         trial[:, 5] = np.clip(trial[:, 5], np.log(0.28), np.log(np.maximum(windows.radius[active], 1.0) * 2.0))
         definite = (trial[:, 2] * trial[:, 4] > trial[:, 3] ** 2) & (trial[:, 2] > 0) & np.isfinite(trial).all(axis=1)
-        trial[~definite] = parameters[active[~definite]]
-        sub = windows.take(active)
-        new = _system(trial, prior[active], sub, fits.take(active), precision[active])
-        better = definite & (new.cost <= cost[active] * (1 + 1e-9) + 1e-9)
+        trial[~definite] = now[~definite]
+        new = _system(trial, prior[active], sub, is_spot[active], shading[active], sub_precision, buffers)
+        better = definite & (new.cost <= best.cost[active] * (1.0 + _COST_DIGITS) + 1e-9)
+        # N step squared is the move in units of sigma
+        move = np.einsum("ni,nij,nj->n", step, best.normal[active], step)
+        # of misfit as large as k sigma the minimum need not be known better than k sigma
+        move /= np.maximum(1.0, best.cost[active] / pixels[active])
         accepted = active[better]
         parameters[accepted] = trial[better]
-        normal[accepted], right[accepted], cost[accepted] = new.normal[better], new.right[better], new.cost[better]
-        weight[accepted], residual[accepted] = new.weight[better], new.residual[better]
+        best.put(accepted, new, better)
         damping[accepted] *= 0.1
         damping[active[~better]] = np.maximum(damping[active[~better]] * 20.0, 1e-3)
-        # N step squared is the move in units of sigma
-        move = np.einsum("ni,nij,nj->n", step, normal[active], step)
-        # of misfit as large as k sigma the minimum need not be known better than k sigma
-        move /= np.maximum(1.0, cost[active] / np.maximum((weight[active] > 0).sum(axis=1), 1))
-        done = (
-            (better & (move < tolerance**2)) | (~better & (damping[active] > 1e4)) | (~better & (move < tolerance**2))
-        )
+        done = (move < tolerance**2) | (~better & (damping[active] > 1e4))
         converged[active[done]] = True
-        active = active[~done]
-        if active.size == 0:
-            break
+        if done.any():
+            left = np.flatnonzero(~done)
+            active = active[left]
+            if active.size == 0:
+                break
+            sub, sub_precision = sub.take(left), sub_precision[left]
     return replace(
-        fits, parameters=parameters, normal=normal, cost=cost, converged=converged, weight=weight, residual=residual
-    )
+        fits, parameters=parameters, normal=best.normal, cost=best.cost, converged=converged,
+        weight=_weight(precision, windows, best.residual), residual=best.residual,
+    )  # fmt: skip
+
+
+def _limited(step: Array, parameters: Array, radius: Array) -> Array:
+    """Steps (n, 12) never larger than a part of the dot."""
+    factor = np.minimum(1.0, 0.3 * (radius + 1.0) / np.maximum(np.hypot(step[:, 0], step[:, 1]), 1e-12))
+    factor = np.minimum(factor, 0.7 / np.maximum(np.abs(step[:, 5]), 1e-12))
+    b_norm = np.abs(parameters[:, 2]) + np.abs(parameters[:, 4])
+    factor = np.minimum(factor, 0.4 * b_norm / np.maximum(np.abs(step[:, 2:5]).sum(axis=1), 1e-12))
+    return step * factor[:, None]
 
 
 def _solve(normal: Array, right: Array, damping: Array, is_spot: NDArray[np.bool_]) -> Array:

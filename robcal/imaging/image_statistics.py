@@ -62,7 +62,7 @@ def noise_inside(
         model, jacobian = evaluate(chosen.parameters, part, chosen.is_spot)
         inverse = chosen.covariance()
         inverse[~np.isfinite(inverse)] = 0.0
-        leverage = chosen.weight * np.einsum("npi,npi->np", np.matmul(jacobian, inverse), jacobian)
+        leverage = chosen.weight * (np.matmul(inverse.astype(jacobian.dtype), jacobian) * jacobian).sum(axis=1)
         half = chosen.parameters[:, 6, None] + 0.6 * chosen.parameters[:, 9, None]
         bright = (chosen.weight > 0) & (model > half)
         free = np.where(bright, np.clip(1.0 - leverage, 0.0, 1.0), 0.0)

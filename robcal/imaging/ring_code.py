@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from robcal.errors import InvalidInput
+from robcal.imaging.edge_model import tail
 
 Array = NDArray[np.float64]
 
@@ -254,11 +255,6 @@ def _is_certain(fit: _Fit, ring: Array, gap: Array, factor: Array, sigma_angle: 
 def ring_glare(xy: Array, b: Array, s: Array, reading: RingReadings, row: Array, x: Array, y: Array) -> Array:
     """Predicted brightness of the ring by the dot's contrast, (n, p), at pixels (n, p), for readings `row`."""
     matrix = _matrices(b)
-    dx, dy = x - xy[:, 0, None], y - xy[:, 1, None]
-    u, v = b[:, :1] * dx + b[:, 1:2] * dy, b[:, 1:2] * dx + b[:, 2:] * dy
-    rho = np.maximum(np.hypot(u, v), 1e-6)
-    n1, n2 = u / rho, v / rho
-    radial = s[:, None] * np.hypot(b[:, :1] * n1 + b[:, 1:2] * n2, b[:, 1:2] * n1 + b[:, 2:] * n2)
     # around the ring the brightness depends on the angle alone; its blur is that at the ring's inner edge, from where
     # the glare comes
     around = np.zeros((len(xy), _ANGLES))
@@ -267,10 +263,19 @@ def ring_glare(xy: Array, b: Array, s: Array, reading: RingReadings, row: Array,
     for k in range(SEGMENTS):
         middle = reading.phase[row] + (k + 0.5) * _SEGMENT_ANGLE
         around += reading.bits[row, k, None] * _window(_wrap(_PHI[None] - middle[:, None]), angular)
+    around = (reading.level[row][:, None] * around).astype(x.dtype)
+    cx, cy, b11, b12, b22, blur = (
+        column.astype(x.dtype)[:, None] for column in (*xy.T, *b.T, s)
+    )  # fmt: skip
+    dx, dy = x - cx, y - cy
+    u, v = b11 * dx + b12 * dy, b12 * dx + b22 * dy
+    rho = np.maximum(np.sqrt(u * u + v * v), 1e-6)
+    n1, n2 = u / rho, v / rho
+    radial = blur * np.sqrt((b11 * n1 + b12 * n2) ** 2 + (b12 * n1 + b22 * n2) ** 2)
     place = np.arctan2(v, u) % (2.0 * np.pi) * (_ANGLES / (2.0 * np.pi)) - 0.5
-    lower = np.floor(place).astype(int)
-    part = place - lower
+    lower = np.floor(place)
+    part, lower = place - lower, lower.astype(np.int64)
     rows = np.arange(len(xy))[:, None]
     total = around[rows, lower % _ANGLES] * (1.0 - part) + around[rows, (lower + 1) % _ANGLES] * part
-    across = ndtr((rho - 2.0) / radial) - ndtr((rho - 3.0) / radial)
-    return reading.level[row][:, None] * total * across
+    across = tail((2.0 - rho) / radial) - tail((3.0 - rho) / radial)
+    return np.asarray(total * across)

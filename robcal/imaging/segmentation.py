@@ -28,6 +28,11 @@ _MAX_PARTS = 3000  # connected parts above the background, holes included; beyon
 _MAX_LARGE = 40  # large parts that are searched with a finer background
 _MAX_DEPTH = 7
 _CROSS = np.ones((5, 5), np.uint8)
+_NEIGHBOURS = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], np.uint8)
+_BAND = 32  # rows
+_AROUND = 4  # px from the middle of the smallest parts to what is taken for their background
+_MANY = 8  # parts of a node from which it pays to look at the smallest together
+_PEAK_BY_CONTRAST = 0.6  # of a spot in the corner of a pixel
 
 
 @dataclass(frozen=True)
@@ -96,15 +101,45 @@ def _nodes_above_background(
     offset = max(0.0, float(np.median(image[::every, ::every].astype(float) - typical)))
     lift = offset + max(5.0 * float(np.sqrt(noise.at(float(np.median(typical))))), 1.5 * noise.step)
     while True:
-        threshold = _raised(background, int(np.ceil(lift)))
-        above = cv2.compare(image, threshold, cv2.CMP_GT)
-        contours, hierarchy = cv2.findContours(above, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
+        above, single = _without_single_pixels(_above(image, _raised(background, int(np.ceil(lift)))))
+        last = lift > 0.3 * top
+        if last or (single <= 20 * _MAX_PARTS and not _has_far_too_many(above)):
+            contours, hierarchy = cv2.findContours(above, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
+            if last or _extended(contours) <= _MAX_PARTS:
+                break
         # texture and dust without end: look at what stands out more
-        extended = sum(len(contour) > 3 for contour in contours)  # single pixels are noise
-        if (extended <= _MAX_PARTS and len(contours) <= 20 * _MAX_PARTS) or lift > 0.3 * top:
-            break
         lift *= 1.6
-    return _first_nodes(above, background, offset, contours, hierarchy, settings, log)
+    log.count(Reason.TOO_SMALL, single)
+    boxes = _boxes(contours, hierarchy, settings, log)
+    high = _stand_out(image, boxes, 0.0, noise, settings)
+    log.count(Reason.CONTRAST, len(boxes) - int(high.sum()))
+    boxes = boxes[high]
+    return _first_nodes(above, background, offset, boxes)
+
+
+def _above(image: NDArray, threshold: NDArray) -> NDArray[np.uint8]:
+    """255 where the image is above the threshold, else 0."""
+    return np.asarray(cv2.compare(image, threshold, cv2.CMP_GT), dtype=np.uint8)
+
+
+def _without_single_pixels(above: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], int]:
+    """A mask without the pixels that have no neighbours (noise), and how many there were."""
+    kept = np.asarray(cv2.bitwise_and(above, cv2.dilate(above, _NEIGHBOURS)), dtype=np.uint8)
+    return kept, cv2.countNonZero(above) - cv2.countNonZero(kept)
+
+
+def _extended(contours: Sequence[NDArray]) -> int:
+    return sum(len(contour) > 3 for contour in contours)
+
+
+def _has_far_too_many(above: NDArray[np.uint8]) -> bool:
+    """Whether an eighth of the image, in bands, shows that the whole has many more parts than are looked at."""
+    bands, height = above.shape[0] // (8 * _BAND), 8 * _BAND
+    if bands < 2:
+        return False
+    some = above[: bands * height].reshape(bands, height, -1)[:, :_BAND].reshape(bands * _BAND, -1)
+    contours, _ = cv2.findContours(some, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
+    return 8 * _extended(contours) > 1.5 * _MAX_PARTS
 
 
 def _raised(image: NDArray, lift: int) -> NDArray:
@@ -145,41 +180,66 @@ def _distinct(rows: Array) -> Array:
     return rows[keep]
 
 
-def _first_nodes(
-    above: NDArray, background: NDArray, offset: float, contours: Sequence[NDArray],
-    hierarchy: NDArray | None, settings: DetectionSettings, log: RejectionLog,
-) -> list[_Node]:  # fmt: skip
-    """Connected parts above the background, by contours (fast where there are few), small ones last in the list."""
-    nodes: list[_Node] = []
+def _boxes(
+    contours: Sequence[NDArray], hierarchy: NDArray | None, settings: DetectionSettings, log: RejectionLog
+) -> NDArray[np.int64]:
+    """Bounding boxes x, y, width, height and a pixel px, py of the parts (k, 6), the largest first."""
     if hierarchy is None:
-        return nodes
-    small = 0
+        return np.zeros((0, 6), np.int64)
     outer = np.flatnonzero(hierarchy[0][:, 3] < 0)
-    boxes: list[tuple[int, int, int, int, int, int, int]] = []
-    for index in outer:
-        contour = contours[int(index)]
-        if len(contour) < 3:
-            small += 1
-            continue
-        x, y, width, height = cv2.boundingRect(contour)
-        if width * height < 4 or min(width, height) < settings.min_axis_px:
-            small += 1
-            continue
-        px, py = (int(value) for value in contour[0, 0])
-        boxes.append((width * height, x, y, width, height, px - x, py - y))
-    log.count(Reason.TOO_SMALL, small)
+    rows = [
+        (*cv2.boundingRect(contour), *contour[0, 0].tolist())
+        for contour in (contours[index] for index in outer.tolist()) if len(contour) > 2
+    ]  # fmt: skip
+    boxes = np.array(rows, dtype=np.int64).reshape(-1, 6)
+    size = boxes[:, 2] * boxes[:, 3]
+    large = (size >= 4) & (boxes[:, 2:4].min(axis=1) >= settings.min_axis_px)
+    log.count(Reason.TOO_SMALL, len(outer) - int(large.sum()))
+    boxes, size = boxes[large], size[large]
     if len(boxes) > _MAX_NODES:
         # what is nearest to a dot's size is looked at first; the rest is counted
         log.count(Reason.OVER_CAP, len(boxes) - _MAX_NODES)
-        smallest = np.pi * settings.min_axis_px**2
-        boxes.sort(key=lambda box: (box[0] < smallest, box[0]))
-        boxes = boxes[:_MAX_NODES]
-    boxes.sort(reverse=True)
-    for _, x, y, width, height, px, py in boxes:
+        chosen = np.lexsort((size, size < np.pi * settings.min_axis_px**2))[:_MAX_NODES]
+        boxes, size = boxes[chosen], size[chosen]
+    return boxes[np.argsort(-size, kind="stable")]
+
+
+def _stand_out(
+    image: NDArray, boxes: NDArray[np.int64], sigma: float, noise: NoiseModel, settings: DetectionSettings
+) -> NDArray[np.bool_]:
+    """(k,) False for the smallest parts that do not stand out from their own surroundings: noise on brighter texture.
+
+    Parameters
+    ----------
+    boxes : (k, >= 4) x, y, width, height in the image. sigma : noise seen there, where it is more than the model's.
+    """
+    height, width = image.shape
+    x, y = boxes[:, 0] + boxes[:, 2] // 2, boxes[:, 1] + boxes[:, 3] // 2
+    far = _AROUND
+    tiny = (boxes[:, 2:4].max(axis=1) <= 4) & (np.minimum(x, y) >= far) & (x < width - far) & (y < height - far)
+    rows = np.flatnonzero(tiny)
+    offset = np.arange(-far, far + 1)
+    around = offset[:, None] * width + offset
+    patch = image.ravel().take((y[rows] * width + x[rows])[:, None, None] + around)
+    ring = np.maximum(np.abs(offset)[:, None], np.abs(offset)) == far
+    base = np.median(patch[:, ring], axis=1)
+    peak = patch[:, far - 2 : far + 3, far - 2 : far + 3].max(axis=(1, 2))
+    least = _PEAK_BY_CONTRAST * settings.min_contrast_sigma * np.maximum(np.sqrt(noise.at(base)), sigma)
+    high = np.ones(len(boxes), bool)
+    high[rows] = peak - base >= least
+    return high
+
+
+def _first_nodes(
+    above: NDArray, background: NDArray, offset: float, boxes: NDArray[np.int64]
+) -> list[_Node]:
+    """Connected parts above the background from their boxes, small ones last in the list."""
+    nodes: list[_Node] = []
+    for x, y, width, height, px, py in boxes.tolist():
         part = above[y : y + height, x : x + width]
         number, labels = cv2.connectedComponents(part, connectivity=8)
         if number > 2:  # others reach into the box
-            part = (labels == labels[py, px]).view(np.uint8)
+            part = (labels == labels[py - y, px - x]).view(np.uint8)
         base = float(background[y + height // 2, x + width // 2]) + offset
         nodes.append(_Node(x, y, part, base, 0))
     return nodes
@@ -192,24 +252,19 @@ def _split(
     """Cuts one node half way between its base and its peak; dots go to `found`, the rest is cut again or refused."""
     height, width = node.mask.shape
     crop = image[node.y : node.y + height, node.x : node.x + width]
-    inside = crop[node.mask > 0]
-    if inside.size < 2:
+    size, peak = _size_and_peak(crop, node.mask)
+    if size < 2:
         return
-    # a high but not the highest value: one hot pixel is no peak
-    rank = min(3, inside.size // 6)
-    peak = float(inside.max() if rank == 0 else np.partition(inside, inside.size - 1 - rank)[inside.size - 1 - rank])
-    sigma = max(float(np.sqrt(noise.at(node.base))), rough_sigma(crop, node.mask) if inside.size > 200 else 0.0)
+    sigma = max(float(np.sqrt(noise.at(node.base))), rough_sigma(crop, node.mask) if size > 200 else 0.0)
     if peak - node.base < 0.6 * settings.min_contrast_sigma * sigma:
         if node.depth == 0:
             log.add(node.x + width / 2, node.y + height / 2, max(width, height) / 2, Reason.CONTRAST)
         return
     level = 0.5 * (node.base + peak)
-    core = ((crop > level) & (node.mask > 0)).view(np.uint8)
-    number, labels, stats, _ = cv2.connectedComponentsWithStats(core, connectivity=4, ltype=cv2.CV_32S)
-    for part in range(1, number):
-        left, upper, w, h, area = (int(value) for value in stats[part])
-        if area < 2:
-            continue
+    core = ((crop > int(level)) & (node.mask > 0)).view(np.uint8)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(core, connectivity=4, ltype=cv2.CV_32S)
+    for part in _worth_a_look(stats, node, image, sigma, noise, settings).tolist():
+        left, upper, w, h, area = stats[part].tolist()
         box = (slice(upper, upper + h), slice(left, left + w))
         mask = (labels[box] == part).view(np.uint8)
         x, y = node.x + left, node.y + upper
@@ -234,19 +289,42 @@ def _split(
                 continue
         log.add(x + w / 2, y + h / 2, max(w, h) / 2, reason)
     # fainter parts of the node that hang together with a brighter one only by its glare
-    if node.depth < _MAX_DEPTH and inside.size > 1.5 * np.count_nonzero(core) + 8:
+    if node.depth < _MAX_DEPTH and size > 1.5 * np.count_nonzero(core) + 8:
         rest = np.where(cv2.dilate(core, _CROSS) > 0, 0, node.mask).astype(np.uint8)
         if np.count_nonzero(rest) >= 6:
             _add_rest(rest, node, crop, settings.min_contrast_sigma * sigma, nodes)
 
 
+def _size_and_peak(crop: NDArray, mask: NDArray[np.uint8]) -> tuple[int, float]:
+    """Number of pixels of a part, and a high but not the highest value of them: one hot pixel is no peak."""
+    if crop.dtype == np.uint8 and crop.size > 5000:
+        above = np.cumsum(cv2.calcHist([crop], [0], mask, [256], [0, 256]).ravel()[::-1].astype(np.int64))
+        return int(above[-1]), float(255 - np.searchsorted(above, min(3, int(above[-1]) // 6) + 1))
+    inside = crop[mask > 0]
+    if inside.size < 12:
+        at = min(inside.size // 6, 3)
+        return inside.size, float(np.sort(inside)[-1 - at]) if inside.size else 0.0
+    at = inside.size - 1 - min(3, inside.size // 6)
+    return inside.size, float(np.partition(inside, at)[at])
+
+
+def _worth_a_look(
+    stats: NDArray, node: _Node, image: NDArray, sigma: float, noise: NoiseModel, settings: DetectionSettings
+) -> NDArray[np.int64]:
+    """Labels of the parts of a node that are more than a pixel, and where there are many, more than noise."""
+    parts = np.arange(1, len(stats))[stats[1:, cv2.CC_STAT_AREA] > 1]
+    if len(parts) < _MANY:
+        return parts
+    boxes = stats[parts, :4].astype(np.int64)
+    boxes[:, :2] += (node.x, node.y)
+    return parts[_stand_out(image, boxes, sigma, noise, settings)]
+
+
 def _add_rest(rest: NDArray[np.uint8], node: _Node, crop: NDArray, lift: float, nodes: list[_Node]) -> None:
     """Adds the connected parts of the rest that have a peak of their own."""
-    number, labels, stats, _ = cv2.connectedComponentsWithStats(rest, connectivity=4, ltype=cv2.CV_32S)
-    for part in range(1, number):
-        left, upper, w, h, area = (int(value) for value in stats[part])
-        if area < 4:
-            continue
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(rest, connectivity=4, ltype=cv2.CV_32S)
+    for part in (1 + np.flatnonzero(stats[1:, cv2.CC_STAT_AREA] >= 4)).tolist():
+        left, upper, w, h, _ = stats[part].tolist()
         box = (slice(upper, upper + h), slice(left, left + w))
         mask = (labels[box] == part).view(np.uint8)
         if float(crop[box][mask > 0].max()) - node.base > lift:

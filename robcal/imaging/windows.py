@@ -1,8 +1,11 @@
-"""Pixels around candidates, gathered into padded arrays of equal width so that all fits of a group run as one."""
+"""Pixels around candidates, gathered into padded arrays of equal width so that all fits of a group run as one.
+
+Places count from a pixel near the candidate, so that single precision holds them to a hundred-thousandth of a pixel.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +15,7 @@ from robcal.imaging.edge_model import matrix_from_axes, signed_distance
 
 Array = NDArray[np.float64]
 
-_PIXELS_PER_GROUP = 25_000  # a group's Jacobian of some 2 MB stays in the processor's cache
+_PIXELS_PER_GROUP = 32_000  # larger ones leave the processor's cache, smaller ones spend the time on calls
 _EVEN_MAX = 250  # pixels kept of the even inside, and of the background; the centre is in the edge
 
 
@@ -22,13 +25,14 @@ class Windows:
 
     Attributes
     ----------
-    index : (n,) rows of the candidates. x, y, value : (n, p). valid : (n, p) bool.
+    index : (n,) rows of the candidates. origin : (n, 2) pixel of the image from which places count.
+    x, y, value : (n, p) place from the origin, px, and grey value, single precision. valid : (n, p) bool.
     u, v : (n, p) x and y from the start's centre in units of its radius.
-    radius : (n,) geometric mean of the start's semi-axes, px.
-    inside : (n, p) bool, well inside the edge. saturated : (n, p) bool.
+    radius : (n,) geometric mean of the start's semi-axes, px. saturated : (n, p) bool.
     """
 
     index: NDArray[np.int64]
+    origin: Array
     x: Array
     y: Array
     u: Array
@@ -36,7 +40,6 @@ class Windows:
     value: Array
     valid: NDArray[np.bool_]
     radius: Array
-    inside: NDArray[np.bool_]
     saturated: NDArray[np.bool_]
 
     def take(self, chosen: NDArray) -> Windows:
@@ -44,6 +47,16 @@ class Windows:
         if len(chosen) == len(self.index) and np.array_equal(chosen, np.arange(len(chosen))):
             return self
         return Windows(*(getattr(self, name)[chosen] for name in Windows.__dataclass_fields__))
+
+    @property
+    def censored(self) -> bool:
+        """Whether any pixel is saturated."""
+        return bool(self.saturated.any())
+
+    def double(self) -> Windows:
+        """The same in double precision."""
+        wide = {name: getattr(self, name).astype(np.float64) for name in ("x", "y", "u", "v", "value")}
+        return replace(self, **wide)
 
 
 def _dilate(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -76,16 +89,25 @@ def gather_windows(image: NDArray, candidates: Candidates, saturation: float, ne
     a2, b2 = candidates.semi_axes[:, 0] ** 2, candidates.semi_axes[:, 1] ** 2
     extent = np.sqrt(np.maximum(a2 * c2 + b2 * s2, a2 * s2 + b2 * c2))
     half = np.ceil(extent + margin).astype(int)
-    # groups of nearly equal size waste little padding
-    size_class = np.where(half <= 12, half, 12 + np.ceil(np.log(np.maximum(half, 12) / 12.0) / 0.2).astype(int))
-    groups: list[Windows] = []
-    for cls in np.unique(size_class):
-        members = np.flatnonzero(size_class == cls)
-        h = int(half[members].max())
-        per_group = max(1, _PIXELS_PER_GROUP // (2 * h + 1) ** 2)
-        for start in range(0, len(members), per_group):
-            chosen = members[start : start + per_group]
-            groups.append(_gather(image, candidates, shape, margin, chosen, h, saturation, neighbours))
+    return [
+        _gather(image, candidates, shape, margin, members, int(half[members].max()), saturation, neighbours)
+        for members in _groups(half)
+    ]
+
+
+def _groups(half: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+    """Windows of half sides (n,) in groups of nearly equal size (little padding) that are large enough to pay."""
+    groups: list[NDArray[np.int64]] = []
+    order = np.argsort(half, kind="stable")
+    begin = 0
+    for end in range(1, len(order) + 1):
+        if end < len(order):
+            pixels = (end + 1 - begin) * (2 * int(half[order[end]]) + 1) ** 2
+            padded = half[order[end]] > 1.15 * half[order[begin]] + 0.5 and pixels > _PIXELS_PER_GROUP // 4
+            if pixels <= _PIXELS_PER_GROUP and not padded:
+                continue
+        groups.append(order[begin:end])
+        begin = end
     return groups
 
 
@@ -98,29 +120,37 @@ def _gather(
     centre = np.rint(candidates.xy[chosen]).astype(int)
     rows, columns = centre[:, 1, None] + offset, centre[:, 0, None] + offset
     within = ((rows >= 0) & (rows < height))[:, :, None] & ((columns >= 0) & (columns < width))[:, None, :]
-    values = image[np.clip(rows, 0, height - 1)[:, :, None], np.clip(columns, 0, width - 1)[:, None, :]].astype(float)
+    places = np.clip(rows, 0, height - 1)[:, :, None] * width + np.clip(columns, 0, width - 1)[:, None, :]
+    values = image.ravel().take(places).astype(np.float32)
     n, side = len(chosen), len(offset)
-    x = np.broadcast_to(columns[:, None, :], (n, side, side)).astype(float)
-    y = np.broadcast_to(rows[:, :, None], (n, side, side)).astype(float)
-    distance = signed_distance(shape[chosen], x.reshape(n, -1), y.reshape(n, -1)).reshape(n, side, side)
-    blur = candidates.blur[chosen][:, None, None]
-    valid = within & (distance < margin[chosen][:, None, None])
+    local = np.concatenate([candidates.xy[chosen] - centre, shape[chosen, 2:]], axis=1)
+    place = offset.astype(np.float32)
+    x: NDArray = np.broadcast_to(place[None, None, :], (n, side, side)).reshape(n, -1)
+    y: NDArray = np.broadcast_to(place[None, :, None], (n, side, side)).reshape(n, -1)
+    distance = signed_distance(local, x, y).reshape(n, side, side)
+    blur = candidates.blur[chosen].astype(np.float32)[:, None, None]
+    valid = within & (distance < margin[chosen].astype(np.float32)[:, None, None])
     if neighbours:
-        base, peak = candidates.base[chosen][:, None, None], candidates.peak[chosen][:, None, None]
-        other = (values > base + 0.2 * (peak - base)) & (distance > 2.0 * blur + 0.7)
+        base, peak = candidates.base[chosen], candidates.peak[chosen]
+        bright = (base + 0.2 * (peak - base)).astype(np.float32)[:, None, None]
+        other = (values > bright) & (distance > 2.0 * blur + 0.7)
         valid &= ~_dilate(other)
-    inside = distance < -(2.5 * blur + 0.5)
     # every k-th row of a large inside or background: neighbours along rows stay, they tell of correlated noise
-    for even in (inside, valid & (distance > 2.5 * blur + 0.5)):
+    for even in (distance < -(2.5 * blur + 0.5), valid & (distance > 2.5 * blur + 0.5)):
         every = np.maximum(1, np.ceil(even.sum(axis=(1, 2)) / _EVEN_MAX)).astype(int)[:, None, None]
-        valid &= ~even | (rows[:, :, None] % every == 0)
-    order = np.argsort(~valid.reshape(n, -1), axis=1, kind="stable")[:, : max(1, int(valid.sum(axis=(1, 2)).max()))]
+        if every.max() > 1:
+            valid &= ~even | (rows[:, :, None] % every == 0)
+    valid = valid.reshape(n, -1)
+    # the valid pixels of each window moved to the front, padded with pixels that are not
+    width_kept = max(1, int(valid.sum(axis=1).max()))
+    order = np.argsort(~valid, axis=1, kind="stable")[:, :width_kept]
 
     def flat(array: NDArray) -> NDArray:
         return np.take_along_axis(array.reshape(n, -1), order, axis=1)
 
     px, py, value = flat(x), flat(y), flat(values)
     radius = np.sqrt(np.prod(candidates.semi_axes[chosen], axis=1))
-    start = candidates.xy[chosen]
-    u, v = (px - start[:, :1]) / radius[:, None], (py - start[:, 1:]) / radius[:, None]
-    return Windows(chosen, px, py, u, v, value, flat(valid), radius, flat(inside), value >= saturation)
+    start = local[:, :2].astype(np.float32)
+    scale = (1.0 / radius).astype(np.float32)[:, None]
+    u, v = (px - start[:, :1]) * scale, (py - start[:, 1:]) * scale
+    return Windows(chosen, centre.astype(float), px, py, u, v, value, flat(valid), radius, value >= saturation)

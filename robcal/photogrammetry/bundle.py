@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Literal, NoReturn
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -207,20 +207,23 @@ def adjust(
         notes.append(note)
     state, summary = minimise(problem, state, max_iterations=settings.max_iterations, tolerance=settings.tolerance)
     work.store(state, images, targets)
-    return finish(
-        problem,
-        state,
-        _together([*work.summaries, summary]),
-        free=tuple(free),
-        left_out=tuple(left_out),
-        image_names=tuple(names[i] for i in images),
-        ids=target_ids[targets],
-        rejected=tuple(work.rejected),
-        lengths=lengths,
-        check_lengths=check_lengths,
-        notes=tuple(notes),
-        variance_components=settings.variance_components,
-    )
+    try:
+        return finish(
+            problem,
+            state,
+            _together([*work.summaries, summary]),
+            free=tuple(free),
+            left_out=tuple(left_out),
+            image_names=tuple(names[i] for i in images),
+            ids=target_ids[targets],
+            rejected=tuple(work.rejected),
+            lengths=lengths,
+            check_lengths=check_lengths,
+            notes=tuple(notes),
+            variance_components=settings.variance_components,
+        )
+    except np.linalg.LinAlgError:
+        _raise_singular(problem, state, free, target_ids[targets])
 
 
 def _together(runs: Sequence[SolveSummary]) -> SolveSummary:
@@ -374,7 +377,7 @@ def _cofactors(problem: Problem, state: State) -> tuple[Factor, Array]:
     return factor, factor.cofactors(problem.null_space(points))
 
 
-def _raise_singular(problem: Problem, state: State, free: Sequence[str], ids: IntArray) -> None:
+def _raise_singular(problem: Problem, state: State, free: Sequence[str], ids: IntArray) -> NoReturn:
     lin = linearise(state, problem.order, problem.basis, problem.shift(state))
     normals = build_normals(lin, problem.weights, problem.order, problem.linearised_bars(state.points))
     points = state.points

@@ -27,4 +27,18 @@ def sum_by(group: NDArray[np.int64], values: Array, n: int) -> Array:
 
 def whitener(covariance: Array) -> Array:
     """Matrices W (..., k, k) with ``W' W = inverse(covariance)`` (inverse Cholesky factors)."""
-    return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)))
+    if covariance.shape[-1] != 2:
+        return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)))
+    # marks are many and 2 x 2: written out
+    a, b, c = covariance[..., 0, 0], covariance[..., 1, 0], covariance[..., 1, 1]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        first = np.sqrt(a)
+        below = b / first
+        second = np.sqrt(c - below**2)
+        W = np.zeros(np.shape(covariance))
+        W[..., 0, 0] = 1.0 / first
+        W[..., 1, 0] = -below / (first * second)
+        W[..., 1, 1] = 1.0 / second
+    if not np.isfinite(W).all():
+        raise np.linalg.LinAlgError("a covariance is not positive definite")
+    return W

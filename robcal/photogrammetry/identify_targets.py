@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from robcal.errors import DegenerateGeometry
 from robcal.imaging.detections import Detections, TargetKind
 from robcal.photogrammetry.bodies import Body, IntArray
 from robcal.photogrammetry.camera import Camera, project_with_jacobians
@@ -16,7 +15,7 @@ from robcal.photogrammetry.eccentric_circle import effective_point
 from robcal.photogrammetry.identify_grid import has_rows, search_grid
 from robcal.photogrammetry.identify_grow import View, view_of
 from robcal.photogrammetry.identify_search import match_dots, search_body
-from robcal.photogrammetry.resection import refine_poses, resect
+from robcal.photogrammetry.resection import PoseFit, Resection, refine_poses, resect_images
 from robcal.transforms import Array, skew, transform
 
 _GATE = 5.0
@@ -81,25 +80,77 @@ def identify_targets(
     others : what other cameras see of the body at this moment (by rows of its uncoded targets with coordinates); they
         may decide between numberings of a regular body.
     """
-    rows, ids = _coded(detections, body)
-    at = body.index(ids)
-    placed = body.known[at] if len(at) else np.zeros(0, dtype=bool)
-    if placed.sum() >= 4:
-        try:
-            fit = resect(
-                camera, ids[placed], detections.xy[rows[placed]], detections.covariance[rows[placed]], body,
-                model_error_px=model_error_px,
-            )  # fmt: skip
-        except DegenerateGeometry:
-            fit = None
-        if fit is not None and fit.inliers.sum() >= 4 and fit.chi2 < 50.0 * max(1, fit.redundancy):
-            keep = np.ones(len(rows), dtype=bool)
-            keep[np.flatnonzero(placed)[~fit.inliers]] = False
+    return identify_images(
+        [detections], body, camera, predictions=[predictions], model_error_px=model_error_px, search=search,
+        others=others,
+    )[0]  # fmt: skip
+
+
+def identify_images(
+    images: Sequence[Detections],
+    body: Body,
+    camera: Camera,
+    *,
+    predictions: Sequence[Sequence[Prediction]] | None = None,
+    model_error_px: float = 3.0,
+    search: bool = True,
+    others: Sequence[View] = (),
+) -> list[IdentifiedImage]:
+    """Identify the targets in many images of one camera: as :func:`identify_targets` does, many poses at once.
+
+    ``predictions`` per image, None for none.
+    """
+    expected = [()] * len(images) if predictions is None else predictions
+    coded = [_coded(detections, body) for detections in images]
+    placed = [body.known[body.index(ids)] if len(ids) else np.zeros(0, dtype=bool) for _, ids in coded]
+    tasks: list[tuple[int, _Start]] = []
+    for k, fit in _resected(images, coded, placed, body, camera, model_error_px).items():
+        if fit.inliers.sum() >= 4 and fit.chi2 < 50.0 * max(1, fit.redundancy):
+            keep = np.ones(len(coded[k][0]), dtype=bool)
+            keep[np.flatnonzero(placed[k])[~fit.inliers]] = False
             prediction = Prediction(fit.camera_T_body, fit.covariance, model_error_px)
-            return _extended(detections, body, camera, rows[keep], ids[keep], prediction, "codes")
+            tasks.append((k, _Start(images[k], coded[k][0][keep], coded[k][1][keep], prediction, "codes")))
+    out: list[IdentifiedImage | None] = [None] * len(images)
+    for (k, _), image in zip(tasks, _extended(body, camera, [start for _, start in tasks]), strict=True):
+        out[k] = image
+    return [
+        image if image is not None
+        else _without_codes(images[k], body, camera, coded[k], expected[k], model_error_px, search, others)
+        for k, image in enumerate(out)
+    ]  # fmt: skip
+
+
+def _resected(
+    images: Sequence[Detections], coded: Sequence[tuple[IntArray, IntArray]], placed: Sequence[NDArray[np.bool_]],
+    body: Body, camera: Camera, model_error_px: float,
+) -> dict[int, Resection]:  # fmt: skip
+    """Poses of the images with four or more coded targets of known place, by number of the image; ``inliers`` count
+    the image's own ``placed`` codes."""
+    several = [k for k, mask in enumerate(placed) if mask.sum() >= 4]
+    if not several:
+        return {}
+    rows = [coded[k][0][placed[k]] for k in several]
+    number = np.repeat(np.arange(len(several)), [len(own) for own in rows])
+    ids = np.concatenate([coded[k][1][placed[k]] for k in several])
+    xy = np.concatenate([images[k].xy[own] for k, own in zip(several, rows, strict=True)])
+    covariance = np.concatenate([images[k].covariance[own] for k, own in zip(several, rows, strict=True)])
+    found = resect_images(camera, number, ids, xy, covariance, body, model_error_px=model_error_px)
+    return {
+        k: replace(fit, inliers=fit.inliers[number == i])
+        for i, (k, fit) in enumerate(zip(several, found, strict=True)) if isinstance(fit, Resection)
+    }  # fmt: skip
+
+
+def _without_codes(
+    detections: Detections, body: Body, camera: Camera, coded: tuple[IntArray, IntArray],
+    predictions: Sequence[Prediction], model_error_px: float, search: bool, others: Sequence[View],
+) -> IdentifiedImage:  # fmt: skip
+    """One image whose codes give no pose: by predictions, then by its geometry."""
+    rows, ids = coded
+    placed = body.known[body.index(ids)] if len(ids) else np.zeros(0, dtype=bool)
     best: IdentifiedImage | None = None
-    for prediction in predictions:
-        trial = _extended(detections, body, camera, rows, ids, prediction, "prediction")
+    starts = [_Start(detections, rows, ids, prediction, "prediction") for prediction in predictions]
+    for trial in _extended(body, camera, starts):
         if len(trial.rows) >= 4 and (best is None or len(trial.rows) > len(best.rows)):
             best = trial
     if best is not None:
@@ -198,60 +249,101 @@ def _free_dots(detections: Detections, used: IntArray) -> IntArray:
     return np.flatnonzero(free)
 
 
-def _extended(
-    detections: Detections, body: Body, camera: Camera, rows: IntArray, ids: IntArray, prediction: Prediction,
-    method: str,
-) -> IdentifiedImage:  # fmt: skip
-    """Add the dots that the pose predicts, refine, and look again with the smaller uncertainty."""
-    pose, C, error = prediction.camera_T_body, prediction.covariance, prediction.error_px
-    coded, coded_ids = rows, ids
-    others = np.flatnonzero(body.known & ~np.isin(body.ids, coded_ids))
-    # a code that was seen twice or unreadable is a dot like the others
-    dots = np.setdiff1d(np.arange(len(detections.xy)), coded)
-    dots = dots[detections.kind[dots] != TargetKind.ARUCO]
-    readable = detections.code[dots]
-    if len(others) == 0 and len(rows):
-        return IdentifiedImage(rows, ids, pose, method)
-    before: tuple[int, ...] | None = None
-    for _ in range(3):
-        predicted, gate, size = _predict(camera, pose, C, body, others, error)
-        blob = detections.semi_axes[dots, 0]
+@dataclass(frozen=True)
+class _Start:
+    """An image with the dots identified by code and where its body is expected."""
+
+    detections: Detections
+    rows: IntArray
+    ids: IntArray
+    prediction: Prediction
+    method: str
+
+
+class _Growth:
+    """One image between two rounds: the pose as known, and what it explains."""
+
+    def __init__(self, start: _Start, body: Body) -> None:
+        self.start = start
+        self.pose, self.covariance = start.prediction.camera_T_body, start.prediction.covariance
+        self.error = start.prediction.error_px
+        self.rows, self.ids = start.rows, start.ids
+        self.others = np.flatnonzero(body.known & ~np.isin(body.ids, start.ids))
+        # a code that was seen twice or unreadable is a dot like the others
+        dots = np.setdiff1d(np.arange(len(start.detections.xy)), start.rows)
+        self.dots = dots[start.detections.kind[dots] != TargetKind.ARUCO]
+        self.done = len(self.others) == 0 and len(start.rows) > 0
+        self._before: tuple[int, ...] | None = None
+
+    def match(self, body: Body, camera: Camera) -> tuple[IntArray, IntArray] | None:
+        """Rows and ids that the pose explains; None where nothing is to be refined any more."""
+        d = self.start.detections
+        predicted, gate, size = predict_dots(camera, self.pose, self.covariance, body, self.others, self.error)
+        blob, readable = d.semi_axes[self.dots, 0], d.code[self.dots]
         with np.errstate(invalid="ignore"):
             like = ~((blob[None] > 1.6 * size[:, None] + 1.0) | (blob[None] < size[:, None] / 1.6 - 1.0))
         # a dot that carries another valid code of this body is not an uncoded target
         other_code = np.isin(readable, body.ids) & (readable >= 0)
-        like &= ~other_code[None] | (readable[None] == body.ids[others][:, None])
-        targets, found = match_dots(predicted, gate, detections.xy[dots], like)
-        new_rows = np.concatenate([coded, dots[found]])
-        new_ids = np.concatenate([coded_ids, body.ids[others[targets]]])
-        now = (*new_rows.tolist(), *new_ids.tolist())
-        if now == before:
+        like &= ~other_code[None] | (readable[None] == body.ids[self.others][:, None])
+        targets, found = match_dots(predicted, gate, d.xy[self.dots], like)
+        rows = np.concatenate([self.start.rows, self.dots[found]])
+        ids = np.concatenate([self.start.ids, body.ids[self.others[targets]]])
+        now = (*rows.tolist(), *ids.tolist())
+        if now == self._before:
+            self.done = True
+            return None
+        self._before = now
+        if (body.known[body.index(ids)].sum() if len(ids) else 0) < 4:
+            self.rows, self.ids, self.done = rows, ids, True
+            return None
+        return rows, ids
+
+    def take(self, rows: IntArray, ids: IntArray, fit: PoseFit, k: int) -> None:
+        """The refined pose and its matches; nothing if the pose is singular."""
+        if not np.isfinite(fit.covariance[k]).all():
+            self.done = True
+            return
+        spread = float(np.sqrt(fit.cost[k] / max(1, fit.redundancy[k])))
+        self.pose, self.covariance = fit.reference_T_body[k], fit.covariance[k] * max(1.0, spread) ** 2
+        self.error = float(np.clip(self.error * spread, 0.1, self.error))
+        self.rows, self.ids = rows, ids
+
+
+def _extended(body: Body, camera: Camera, starts: Sequence[_Start]) -> list[IdentifiedImage]:
+    """Add the dots that the poses predict, refine all poses, and look again with the smaller uncertainties."""
+    images = [_Growth(start, body) for start in starts]
+    normals = body.estimated_normals()
+    for _ in range(3):
+        matched = [(g, found) for g in images if not g.done and (found := g.match(body, camera)) is not None]
+        if not matched:
             break
-        before = now
-        usable = body.known[body.index(new_ids)] if len(new_ids) else np.zeros(0, dtype=bool)
-        if usable.sum() < 4:
-            return IdentifiedImage(new_rows, new_ids, pose, method)
-        at = body.index(new_ids[usable])
-        k = len(at)
-        zero = np.zeros(k, dtype=np.int64)
-        cov = detections.covariance[new_rows[usable]] + error**2 * np.eye(2)
+        usable = [body.known[body.index(ids)] for _, (_, ids) in matched]
+        pose = np.repeat(np.arange(len(matched)), [int(mask.sum()) for mask in usable])
+        at = np.concatenate([body.index(ids[mask]) for (_, (_, ids)), mask in zip(matched, usable, strict=True)])
+        xy, covariance = [], []
+        for (g, (rows, _)), mask in zip(matched, usable, strict=True):
+            xy.append(g.start.detections.xy[rows[mask]])
+            covariance.append(g.start.detections.covariance[rows[mask]] + g.error**2 * np.eye(2))
         fit = refine_poses(
-            pose[None], zero, zero, [camera], np.eye(4)[None], body.points[at], detections.xy[new_rows[usable]], cov,
-            radius=0.5 * body.diameters[at], normals=body.estimated_normals()[at],
+            np.array([g.pose for g, _ in matched]), pose, np.zeros(len(pose), dtype=np.int64), [camera],
+            np.eye(4)[None], body.points[at], np.concatenate(xy), np.concatenate(covariance),
+            radius=0.5 * body.diameters[at], normals=normals[at],
         )  # fmt: skip
-        if not np.isfinite(fit.covariance[0]).all():
-            break
-        spread = float(np.sqrt(fit.cost[0] / max(1, 2 * k - 6)))
-        pose, C = fit.reference_T_body[0], fit.covariance[0] * max(1.0, spread) ** 2
-        error = float(np.clip(error * spread, 0.1, error))
-        rows, ids = new_rows, new_ids
-    return IdentifiedImage(rows, ids, pose, method)
+        for k, (g, (rows, ids)) in enumerate(matched):
+            g.take(rows, ids, fit, k)
+    return [IdentifiedImage(g.rows, g.ids, g.pose, g.start.method) for g in images]
 
 
-def _predict(
+def predict_dots(
     camera: Camera, pose: Array, covariance: Array | None, body: Body, targets: IntArray, error_px: float
 ) -> tuple[Array, Array, Array]:
-    """Image places (n, 2) of targets, search radii (n,) px and expected semi-axes (n,) px (NaN where not known)."""
+    """Where a pose puts targets in the image.
+
+    Returns
+    -------
+    Places (n, 2) px, NaN where they cannot be seen; search radii (n,) px; expected semi-axes (n,) px, NaN where the
+    diameter is not known.
+    """
     X = body.points[targets]
     normals = body.estimated_normals()[targets] @ pose[:3, :3].T
     p = transform(pose, X)

@@ -333,7 +333,7 @@ def _groups(keys: IntArray, order: IntArray) -> dict[int, IntArray]:
 def _bad_fit(chi2: float, redundancy: int, covariance: Array, factor: float) -> str | None:
     """Why a fit is not to be trusted although its lengths are (a mirrored or wrongly numbered body)."""
     if not np.isfinite(covariance).all() or np.sqrt(np.trace(covariance[3:, 3:])) > 0.2:
-        return "the targets measured do not determine the orientation of the body"
+        return "the targets measured do not determine the orientation of the body (or their sigmas are too large)"
     if redundancy > 0 and stats.chi2.sf(chi2 / max(factor, 1.0) ** 2, redundancy) < 1e-12:
         return f"{_MISFIT} (chi-square {chi2:.0f} with {redundancy}): mirrored or misnumbered targets"
     return None

@@ -8,10 +8,11 @@ Triggs, McLauchlan, Hartley, Fitzgibbon (2000), "Bundle adjustment: a modern syn
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg, sparse
+from scipy import linalg
 
 from robcal.errors import NotIdentifiable
 from robcal.photogrammetry.camera import INTRINSIC_NAMES, Camera, project_with_jacobians
@@ -171,30 +172,61 @@ class _System:
 
 def _normal(lin: Linearisation, marks: MarkTable, x: Unknowns, prior: Prior, weights: Array) -> _System:
     e, c, t, p = len(x.world_T_exterior), len(x.interior), len(x.points), len(x.world_T_body)
-    g, m = 6 * e + 9 * c + 3 * t, len(marks)
+    g = 6 * e + 9 * c + 3 * t
     root = np.sqrt(weights)[:, None]
-    blocks = np.concatenate([lin.by_exterior, lin.by_interior, lin.by_point], axis=-1) * root[..., None]
-    B = lin.by_pose * root[..., None]
+    S = np.concatenate([lin.by_exterior, lin.by_interior], axis=-1) * root[..., None]
+    P, B = lin.by_point * root[..., None], lin.by_pose * root[..., None]
     r = lin.residual * root
-    columns = np.repeat(global_columns(marks, e, c), 2, axis=0)
-    pointer = np.arange(0, 2 * m * 18 + 1, 18)
-    A = sparse.csr_matrix((blocks.reshape(-1), columns.reshape(-1), pointer), shape=(2 * m, g))
-    pose_columns = np.repeat(6 * marks.pose[:, None] + np.arange(6), 2, axis=0)
-    P = sparse.csr_matrix((B.reshape(-1), pose_columns.reshape(-1), np.arange(0, 12 * m + 1, 6)), shape=(2 * m, 6 * p))
-    N0, b0, _ = _prior_terms(x, prior)
-    N = (A.T @ A).toarray() + N0
-    b = A.T @ r.ravel() + b0
-    W = (A.T @ P).toarray()
-    V = sum_by(marks.pose, np.swapaxes(B, -1, -2) @ B, p)
-    v = np.asarray(P.T @ r.ravel()).reshape((p, 6))
+    N, b, _ = _prior_terms(x, prior)
+    W = np.zeros((g, p, 6))
+    points = slice(6 * e + 9 * c, g)
+    b[points] += sum_by(marks.target, np.einsum("mki,mk->mi", P, r), t).ravel()
+    pair = marks.target * p + marks.pose
+    W[points] = sum_by(pair, _product(P, B), t * p).reshape(t, p, 3, 6).transpose(0, 2, 1, 3).reshape(3 * t, p, 6)
+    V, v = np.zeros((p, 6, 6)), np.zeros((p, 6))
+    # marks of one image have the same columns but for the point, marks of one target in one camera but for the pose
+    image = np.concatenate([S, B, r[..., None]], axis=-1)
+    for rows in _groups(marks.exterior * p + marks.pose):
+        at, k = _station_columns(marks, rows[0], e), int(marks.pose[rows[0]])
+        flat = image[rows].reshape(-1, 22)
+        products = flat.T @ flat
+        N[np.ix_(at, at)] += products[:15, :15]
+        b[at] += products[:15, 21]
+        W[at, k] += products[:15, 15:21]
+        V[k] += products[15:21, 15:21]
+        v[k] += products[15:21, 21]
+    sight = np.concatenate([S, P], axis=-1)
+    for rows in _groups(marks.exterior * t + marks.target):
+        at, first = _station_columns(marks, rows[0], e), 6 * e + 9 * c + 3 * int(marks.target[rows[0]])
+        flat = sight[rows].reshape(-1, 18)
+        products = flat[:, 15:].T @ flat
+        N[first : first + 3, at] += products[:, :15]
+        N[at, first : first + 3] += products[:, :15].T
+        N[first : first + 3, first : first + 3] += products[:, 15:]
     scale = np.sqrt(np.maximum(np.einsum("pii->pi", V), 1e-300))
     seen = np.einsum("pii->pi", V).min(axis=1) > 0  # a pose whose marks were all left out keeps its value
     Vi = np.zeros_like(V)
     outer = scale[:, :, None] * scale[:, None, :]
     Vi[seen] = np.linalg.inv(V[seen] / outer[seen] + 1e-13 * np.eye(6)) / outer[seen]
-    W3 = W.reshape(g, p, 6)
-    T = np.einsum("gpi,pij->gpj", W3, Vi).reshape(g, 6 * p)
-    return _System(N - T @ W.T, b - T @ v.ravel(), Vi, W3, v)
+    T = np.matmul(W.transpose(1, 0, 2), Vi).transpose(1, 0, 2).reshape(g, 6 * p)
+    return _System(N - T @ W.reshape(g, 6 * p).T, b - T @ v.ravel(), Vi, W, v)
+
+
+def _groups(key: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+    """Rows (of those with the same key) group by group."""
+    order = np.argsort(key, kind="stable")
+    edges = np.flatnonzero(np.diff(key[order])) + 1
+    return [order[i:j] for i, j in pairwise([0, *edges.tolist(), len(order)])] if len(order) else []
+
+
+def _station_columns(marks: MarkTable, row: int, e: int) -> NDArray[np.int64]:
+    """(15,) global columns of a mark's exterior and interior unknowns."""
+    return np.concatenate([6 * marks.exterior[row] + np.arange(6), 6 * e + 9 * marks.camera[row] + np.arange(9)])
+
+
+def _product(A: Array, B: Array) -> Array:
+    """(m, i, j) products A' B of each mark's derivatives (m, 2, i) and (m, 2, j)."""
+    return np.asarray(A[:, 0, :, None] * B[:, 0, None, :] + A[:, 1, :, None] * B[:, 1, None, :])
 
 
 def _solve_scaled(S: Array, b: Array, names: list[str]) -> tuple[Array, Array]:
@@ -331,17 +363,22 @@ def covariance_blocks(design: StationDesign, marks: MarkTable, e: int, c: int) -
     """
     Q, Vi, W = design.reduced_inverse, design.pose_inverse, design.coupling
     g, p = len(Q), len(Vi)
-    T = np.einsum("gpi,pij->gpj", W, Vi)
-    Qgp = -(Q @ T.reshape(g, 6 * p)).reshape(g, p, 6)
-    Qpp = Vi - np.einsum("gpi,gpj->pij", T, Qgp)
+    T = np.matmul(W.transpose(1, 0, 2), Vi)
+    Qgp = -np.matmul(Q, T.transpose(1, 0, 2).reshape(g, 6 * p)).reshape(g, p, 6)
+    Qpp = Vi - np.matmul(T.transpose(0, 2, 1), Qgp.transpose(1, 0, 2))
     columns = global_columns(marks, e, c)
     A = np.concatenate([design.by_exterior, design.by_interior, design.by_point], axis=-1)
     B = design.by_pose
-    cross = A @ Qgp[columns, marks.pose[:, None]] @ np.swapaxes(B, -1, -2)
-    covariance = (
-        A @ Q[columns[:, :, None], columns[:, None, :]] @ np.swapaxes(A, -1, -2)
-        + cross
-        + np.swapaxes(cross, -1, -2)
-        + B @ Qpp[marks.pose] @ np.swapaxes(B, -1, -2)
-    )
+    covariance = np.empty((len(marks), 2, 2))
+    # marks of one target in one exterior orientation have the same columns
+    group = marks.exterior * (int(marks.target.max(initial=0)) + 1) + marks.target
+    for rows in _groups(group):
+        at = columns[rows[0]]
+        own = A[rows]
+        covariance[rows] = np.matmul((own.reshape(-1, 18) @ Q[np.ix_(at, at)]).reshape(own.shape),
+                                     own.transpose(0, 2, 1))  # fmt: skip
+        both = np.matmul(own, Qgp[np.ix_(at, marks.pose[rows])].transpose(1, 0, 2))
+        cross = np.matmul(both, B[rows].transpose(0, 2, 1))
+        covariance[rows] += cross + cross.transpose(0, 2, 1)
+    covariance += np.matmul(np.matmul(B, Qpp[marks.pose]), B.transpose(0, 2, 1))
     return Qpp, np.eye(2) - covariance

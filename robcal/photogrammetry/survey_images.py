@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robcal.errors import DegenerateGeometry, InvalidInput
+from robcal.imaging.detections import TargetKind
 from robcal.photogrammetry.network import ImageMarks, IntArray
 from robcal.photogrammetry.survey_matching import Sightings
 from robcal.transforms import Array
@@ -24,7 +25,8 @@ class Collection:
 
     Attributes
     ----------
-    names : of the usable images. image (d,), xy (d, 2), covariance (d, 2, 2), semi_axes (d, 2; NaN where unknown).
+    names : of the usable images. image (d,), xy (d, 2), covariance (d, 2, 2), semi_axes (d, 2) and angle (d,) of the
+        ellipses, NaN where unknown.
     ids : (t,) ids of the identified targets. assigned : (d,) row of the target, -1: unknown.
     barred : (d,) detections that the adjustment has thrown out.
     unused : (name, reason) of images left out already. notes : what else to say.
@@ -35,6 +37,7 @@ class Collection:
     xy: Array
     covariance: Array
     semi_axes: Array
+    angle: Array
     ids: IntArray
     assigned: IntArray
     barred: NDArray[np.bool_]
@@ -72,12 +75,12 @@ def collect(images: Sequence[SurveyImage], targets: Sequence[BodyTarget], length
     if listed:
         listed |= {int(v) for v in np.ravel(lengths)}
     names: list[str] = []
-    columns: list[tuple[Array, Array, Array, IntArray]] = []
+    columns: list[tuple[Array, Array, Array, Array, IntArray]] = []
     unused: list[tuple[str, str]] = []
     notes: list[str] = []
     unknown_codes: dict[int, int] = {}
     for image in images:
-        xy, covariance, axes, codes = _columns(image)
+        xy, covariance, axes, angle, codes = _columns(image)
         if len(xy) == 0:
             message = image.detections.message if image.detections is not None else ""
             unused.append((image.name, message or "no targets found"))
@@ -97,7 +100,7 @@ def collect(images: Sequence[SurveyImage], targets: Sequence[BodyTarget], length
             notes.append(f"image {image.name}: target {', '.join(map(str, double.tolist()))} appears more than once")
             codes = np.where(np.isin(codes, double), -1, codes)
         names.append(image.name)
-        columns.append((xy, covariance, axes, codes))
+        columns.append((xy, covariance, axes, angle, codes))
     if len(names) < 2:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in unused[:5])
         raise DegenerateGeometry(
@@ -108,7 +111,7 @@ def collect(images: Sequence[SurveyImage], targets: Sequence[BodyTarget], length
     if often:
         notes.append(f"codes seen but not listed in the body: {sorted(often)}; their dots are treated as uncoded")
     image_index = np.concatenate([np.full(len(c[0]), i) for i, c in enumerate(columns)]).astype(np.int64)
-    codes = np.concatenate([c[3] for c in columns]).astype(np.int64)
+    codes = np.concatenate([c[4] for c in columns]).astype(np.int64)
     # a code seen once cannot be located from it; its dot may still be found as an uncoded one
     values, counts = np.unique(codes[codes >= 0], return_counts=True)
     ids = values[counts >= 2]
@@ -120,6 +123,7 @@ def collect(images: Sequence[SurveyImage], targets: Sequence[BodyTarget], length
         np.concatenate([c[0] for c in columns]),
         np.concatenate([c[1] for c in columns]),
         np.concatenate([c[2] for c in columns]),
+        np.concatenate([c[3] for c in columns]),
         ids.astype(np.int64),
         assigned,
         np.zeros(d, dtype=bool),
@@ -139,7 +143,7 @@ def _check_names(images: Sequence[SurveyImage], targets: Sequence[BodyTarget]) -
         raise InvalidInput(f"the body lists target {twice[0]} twice: ids must be unique")
 
 
-def _columns(image: SurveyImage) -> tuple[Array, Array, Array, IntArray]:
+def _columns(image: SurveyImage) -> tuple[Array, Array, Array, Array, IntArray]:
     if image.marks is not None:
         ids, xy, covariance = (np.asarray(column) for column in image.marks)
         if xy.shape != (len(ids), 2) or covariance.shape != (len(ids), 2, 2):
@@ -147,8 +151,11 @@ def _columns(image: SurveyImage) -> tuple[Array, Array, Array, IntArray]:
         if not np.all(np.isfinite(xy)):
             bad = ids[~np.isfinite(xy).all(axis=1)][0]
             raise InvalidInput(f"image {image.name}, target {bad}: a coordinate is no number, remove the row")
-        return xy.astype(float), covariance.astype(float), np.full((len(ids), 2), np.nan), ids.astype(np.int64)
+        none = np.full((len(ids), 2), np.nan)
+        return xy.astype(float), covariance.astype(float), none, none[:, 0], ids.astype(np.int64)
     if image.detections is None:
         raise InvalidInput(f"image {image.name} has neither detections nor marks")
     found = image.detections
-    return found.xy, found.covariance, found.semi_axes, found.code.astype(np.int64)
+    # a square marker shows no ellipse
+    angle = np.where(found.kind == TargetKind.ARUCO, np.nan, found.angle)
+    return found.xy, found.covariance, found.semi_axes, angle, found.code.astype(np.int64)

@@ -12,6 +12,7 @@ from robcal.errors import InvalidInput, NotIdentifiable
 from robcal.photogrammetry.bundle import AdjustSettings, adjust
 from robcal.photogrammetry.camera import Camera
 from robcal.photogrammetry.datum import DatumWish, InnerOver, spans_triangle
+from robcal.photogrammetry.discs import Discs, discs_from_ellipses, facing_normals, modelled_discs, size_ratio
 from robcal.photogrammetry.eccentricity import body_normals
 from robcal.photogrammetry.network import CameraNetwork, IntArray, Lengths, RejectedMark
 from robcal.photogrammetry.start_network import StartNetwork, approximate_network
@@ -19,6 +20,7 @@ from robcal.photogrammetry.survey_frame import Similarity, body_frame, fit_simil
 from robcal.photogrammetry.survey_images import Collection
 from robcal.photogrammetry.survey_late import place_late
 from robcal.photogrammetry.survey_matching import Geometry, find_new_points, is_dot, match_known, seen_diameters
+from robcal.photogrammetry.survey_plausibility import rough_scale, scale_notes
 from robcal.photogrammetry.survey_types import BodyTarget, SurveyResult, SurveySettings
 from robcal.transforms import Array
 
@@ -53,6 +55,9 @@ class Survey:
         self.common_diameter = common.pop() if len(common) == 1 else None
         # targets of the network in the making: ids, assigned detections
         self.ids: list[int] = []
+        # what the ellipses say about the discs, of the targets with these ids, in the scale of the last adjustment
+        self.size_ratio: float | None = None
+        self._discs: tuple[list[int], Discs] | None = None
         self.new_rows: set[int] = set()
         self.rejected: list[RejectedMark] = []
         self._new_name: dict[int, int] = {}
@@ -155,7 +160,16 @@ class Survey:
             image=np.searchsorted(image_rows, marks.image),
             target=np.searchsorted(target_rows, marks.target),
         )
-        diameters = self.diameters()
+        stated = self.diameters()
+        diameters, normals = None, None
+        if stated is not None:
+            axes, angle = self.data.semi_axes[use], self.data.angle[use]
+            seen = discs_from_ellipses(
+                camera, poses[image_rows], points[target_rows], marks.image, marks.target, axes, angle
+            )
+            self._discs = [self.ids[i] for i in target_rows], seen
+            self.size_ratio = size_ratio(seen, stated[target_rows])
+            diameters, normals = modelled_discs(seen, stated[target_rows], points[target_rows])
         return adjust(
             marks,
             camera,
@@ -166,7 +180,8 @@ class Survey:
             lengths=lengths,
             check_lengths=checks,
             datum=datum,
-            diameters=None if diameters is None else diameters[target_rows],
+            diameters=diameters,
+            normals=normals,
             free_intrinsics=self.settings.free_intrinsics if free is None else free,
             settings=settings or self.adjust_settings,
         )
@@ -408,14 +423,20 @@ class Survey:
         self._name_new(network)
         ids = np.array([self._new_name.get(int(i), int(i)) for i in network.ids])
         network = replace(network, ids=ids)
-        if len(self.bars):
-            network = self._readjust(network, lengths=self.bars, checks=self.checks)
-            self._take_over(network)
         given = np.array([self.given.get(int(i), np.full(3, np.nan)) for i in network.ids])
+        if len(self.bars):
+            # to metres first: sizes of dots must be in the scale of the coordinates
+            rough = Similarity(rough_scale(network, self.bars), np.eye(4), "scale bars")
+            self.notes += scale_notes(network, given, self.bars, self.checks, rough.scale, self.size_ratio)
+            network = self._readjust(network, lengths=self.bars, checks=self.checks, frame=rough)
+            self._take_over(network)
+            given = np.array([self.given.get(int(i), np.full(3, np.nan)) for i in network.ids])
         known = [int(i) for i, g in zip(network.ids, given, strict=True) if np.isfinite(g).all()]
         R, t = network.camera_T_body[:, :3, :3], network.camera_T_body[:, :3, 3]
         stations = -np.einsum("nij,ni->nj", R, t)
         frame = body_frame(network.points, network.ids, given, stations, with_scale=len(self.bars) == 0)
+        if len(self.bars) == 0:
+            self.notes += scale_notes(network, given, self.bars, self.checks, frame.scale, self.size_ratio)
         if len(self.bars) == 0 and not isinstance(datum, tuple) and len(known) < 2:
             raise NotIdentifiable(
                 "fewer than two targets with given coordinates were found, so nothing gives the scale: photograph a "
@@ -467,6 +488,11 @@ class Survey:
             for i, p in zip(network.ids, network.points, strict=True)
             if int(i) in self.given
         ]
+        normals = np.full((len(network.ids), 3), np.nan)
+        if self._discs is not None:
+            ids, seen = self._discs
+            rows = [ids.index(int(i)) for i in network.ids]
+            normals = facing_normals(network.normals, seen.select(np.array(rows, dtype=np.int64)))
         named = [replace(r, target=self._new_name.get(r.target, r.target)) for r in self.rejected]
         network = replace(network, rejected=tuple(dict.fromkeys(named)))
         return SurveyResult(
@@ -479,5 +505,6 @@ class Survey:
             free_detections=int(np.count_nonzero(self.data.assigned < 0)),
             deviations=tuple(deviations),
             engine=engine,
+            normals=normals,
             notes=tuple(dict.fromkeys([*self.notes, *network.notes])),
         )

@@ -73,6 +73,7 @@ class SurveyResult:
     unused_images : (name, reason). free_detections : detections that belong to no target.
     deviations : (id, metres) distance of each given coordinate from the surveyed one, after the fit.
     engine : which bundle engine made it.
+    normals : (t, 3) outer unit normals of the network's targets where the ellipses tell them, else NaN.
     """
 
     network: CameraNetwork
@@ -84,4 +85,5 @@ class SurveyResult:
     free_detections: int
     deviations: tuple[tuple[int, float], ...]
     engine: str
+    normals: Array
     notes: tuple[str, ...]

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from robcal.diagnosis.blunders import worst_group
 from robcal.diagnosis.family_wise import simulate
-from robcal.diagnosis.scan import Entry, log_bayes_factor, orthonormal_basis, remove, scan, stack_entries
+from robcal.diagnosis.scan import Entry, log_bayes_factor, orthonormal_basis, remove, restack, scan, stack_entries
 
 ROWS, PARAMETERS = 120, 12
 
@@ -87,3 +87,18 @@ def test_a_preferred_sign_shares_out_the_same_evidence() -> None:
     mirrored = log_bayes_factor(singular, z[::-1], np.full(2, 0.9))
     assert np.logaddexp(preferred, mirrored) == pytest.approx(plain + np.log(2.0))
     assert log_bayes_factor(singular, z, np.full(2, 0.5)) == pytest.approx(plain)
+
+
+def test_restacking_equals_stacking_with_the_larger_model() -> None:
+    basis, listed = problem(7, width=3)
+    extra = listed[4].columns
+    further = orthonormal_basis(remove(basis, extra))
+    whole = np.concatenate([basis, further], axis=1)
+    residual = remove(whole, np.random.default_rng(3).normal(size=(ROWS, 1)))[:, 0]
+    redundancy = ROWS - whole.shape[1]
+    direct = scan(stack_entries(listed, whole), residual, redundancy)
+    again = scan(restack(stack_entries(listed, basis), further), residual, redundancy)
+    assert np.array_equal(direct.count, again.count)
+    assert np.allclose(direct.chi2, again.chi2, atol=1e-9)
+    seen = direct.count > 0
+    assert np.allclose(direct.log_evidence[seen], again.log_evidence[seen], atol=1e-9)

@@ -9,7 +9,7 @@ from robcal.imaging.cramer_rao import centre_bound
 from robcal.imaging.detect import detect_targets, saturation_level
 from robcal.imaging.detections import Detections, Reason
 from robcal.imaging.noise import NoiseModel
-from robcal.imaging.ring_code import is_id
+from robcal.imaging.ring_code import canonical_id, is_id
 from robcal.imaging.settings import DetectionSettings
 from tests.imaging.rendering import Dot, expose, render, scene
 
@@ -74,6 +74,26 @@ def test_bias_under_shading_is_below_a_hundredth() -> None:
     error, row = errors(found, dots)
     assert np.abs(error.mean(axis=0)).max() < 0.01
     assert np.median(found.gain_gradient[row, 0]) == pytest.approx(0.1 / (2 * a), rel=0.25)
+
+
+@pytest.mark.parametrize("blur", [0.7, 1.0])
+@pytest.mark.parametrize("radius", [2.5, 4.0, 6.0])
+@pytest.mark.parametrize("known", [True, False])
+def test_ring_around_does_not_pull_the_centre(radius: float, blur: float, known: bool) -> None:
+    rng = np.random.default_rng(3)
+    bits = 0b111110000000  # all light on one side
+    phases, pitch = rng.uniform(0, 2 * np.pi, 25), int(7 * radius + 14)
+    places = (np.indices((5, 5)).reshape(2, -1).T + 0.5) * pitch + rng.uniform(-0.5, 0.5, (25, 2))
+    dots = [Dot(*place, radius, radius, 0.0, bits, phase) for place, phase in zip(places, phases, strict=True)]
+    image = expose(render(5 * pitch, 5 * pitch, dots, blur), rng, read_noise=0.5, gain=0.01)
+    codes = frozenset({canonical_id(bits) if known else 0b101010101011})
+    found = detect_targets(image, DetectionSettings(known_codes=codes))
+    distance, row = cKDTree(found.xy).query(places)
+    assert distance.max() < 0.2
+    assert (found.code[row] >= 0).all() == known
+    middle = phases + 2.5 * np.pi / 6
+    towards = np.stack([np.cos(middle), np.sin(middle)], axis=-1)
+    assert abs(((found.xy[row] - places) * towards).sum(axis=1).mean()) < 0.01
 
 
 @pytest.mark.parametrize("bits", [8, 16])

@@ -45,14 +45,42 @@ def sphere_points(rng: np.random.Generator, count: int, radius: float = 0.2) -> 
     return radius * v / np.linalg.norm(v, axis=1, keepdims=True)
 
 
-def polygon_centre(camera: Camera, p_camera: Array, normal: Array, radius: float, corners: int = 720) -> Array:
-    """Area centroid (2,) of the image of a disc, from its outline as a polygon: brute force."""
+def cube_points(rng: np.random.Generator, count: int, half: float = 0.15) -> tuple[Array, Array]:
+    """Points and outer normals of dots on the six faces of a cube, as many on each."""
+    points, normals = [], []
+    for k in range(count):
+        axis, side = k % 3, 1.0 if (k // 3) % 2 else -1.0
+        p = rng.uniform(-0.8 * half, 0.8 * half, 3)
+        p[axis] = side * half
+        points.append(p)
+        normals.append(side * np.eye(3)[axis])
+    return np.array(points), np.array(normals)
+
+
+def disc_outline(camera: Camera, p_camera: Array, normal: Array, radius: float, corners: int = 720) -> Array:
+    """Image (corners, 2) of the edge of a disc: brute force."""
     helper = np.array([1.0, 0.0, 0.0]) if abs(normal[0]) < 0.7 else np.array([0.0, 1.0, 0.0])
     e1 = np.cross(normal, helper)
     e1 /= np.linalg.norm(e1)
     e2 = np.cross(normal, e1)
     angle = np.linspace(0.0, 2.0 * np.pi, corners, endpoint=False)[:, None]
-    outline = project(camera, p_camera + radius * (np.cos(angle) * e1 + np.sin(angle) * e2))
+    return project(camera, p_camera + radius * (np.cos(angle) * e1 + np.sin(angle) * e2))
+
+
+def polygon_axes(outline: Array) -> tuple[Array, float]:
+    """Semi-axes (2,), major first, and angle of the major one of the ellipse through an outline (corners, 2)."""
+    x, y = (outline - outline.mean(axis=0)).T
+    # conic through the outline: a x^2 + b xy + c y^2 + d x + e y = 1
+    a, b, c, d, e = np.linalg.lstsq(np.column_stack([x * x, x * y, y * y, x, y]), np.ones(len(x)), rcond=None)[0]
+    form = np.array([[a, b / 2], [b / 2, c]])
+    centre = np.linalg.solve(form, [-d / 2, -e / 2])
+    values, vectors = np.linalg.eigh(form / (1.0 + centre @ form @ centre))
+    return 1.0 / np.sqrt(values), float(np.arctan2(vectors[1, 0], vectors[0, 0]))
+
+
+def polygon_centre(camera: Camera, p_camera: Array, normal: Array, radius: float, corners: int = 720) -> Array:
+    """Area centroid (2,) of the image of a disc, from its outline as a polygon: brute force."""
+    outline = disc_outline(camera, p_camera, normal, radius, corners)
     origin = outline.mean(axis=0)
     a, b = outline - origin, np.roll(outline - origin, -1, axis=0)
     cross = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
@@ -73,12 +101,17 @@ def make_network(
     tilt: tuple[float, float] = (0.1, 0.8),
     rolled: bool = True,
 ) -> Truth:
-    """Cameras rolled and all around a plate or a sphere, marks with independent normal noise."""
+    """Cameras rolled and all around a plate, a sphere or a cube, marks with independent normal noise."""
     width, height = size
     f = focal_factor * width
     camera = Camera(width, height, f, f * 1.0004, width / 2 + 12.0, height / 2 - 8.0, *distortion)
-    points = plate_points(rng, targets) if body == "plate" else sphere_points(rng, targets)
-    normals = np.tile([0.0, 0.0, 1.0], (targets, 1)) if body == "plate" else points / 0.2
+    if body == "plate":
+        points, normals = plate_points(rng, targets), np.tile([0.0, 0.0, 1.0], (targets, 1))
+    elif body == "cube":
+        points, normals = cube_points(rng, targets)
+    else:
+        points = sphere_points(rng, targets)
+        normals = points / 0.2
     reach = float(np.max(np.linalg.norm(points, axis=1)))
     poses = []
     for _ in range(images):
@@ -101,7 +134,7 @@ def make_network(
     n = np.einsum("mij,mj->mi", T[image, :3, :3], normals[target])
     xy = project(camera, p)
     seen = np.all((xy > 12) & (xy < [width - 12, height - 12]), axis=1)
-    if body == "sphere":
+    if body != "plate":
         seen &= np.einsum("mi,mi->m", n, p) / np.linalg.norm(p, axis=1) < -0.3
     image, target, xy, p, n = image[seen], target[seen], xy[seen], p[seen], n[seen]
     if diameter:
@@ -127,10 +160,19 @@ def detections(
         depth = transform(truth.camera_T_body[j], truth.points[marks.target[rows]])[:, 2]
         major = 0.5 * (truth.diameter or 0.008) * truth.camera.fx / depth
         axes = np.concatenate([major, rng.uniform(2.0, 20.0, clutter)])
+        axes, angle = np.column_stack([axes, 0.9 * axes]), np.full(m, np.nan)
+        if truth.diameter:
+            for k, row in enumerate(rows):
+                T, at = truth.camera_T_body[j], marks.target[row]
+                p, n = transform(T, truth.points[at]), T[:3, :3] @ truth.normals[at]
+                axes[k], angle[k] = polygon_axes(disc_outline(truth.camera, p, n, truth.diameter / 2, 60))
+                axes[k] *= 1.0 + rng.normal(0.0, 0.003, 2)
         found = SimpleNamespace(
             xy=xy,
             covariance=np.tile(np.eye(2) * truth.sigma**2, (m, 1, 1)),
-            semi_axes=np.column_stack([axes, 0.9 * axes]),
+            semi_axes=axes,
+            angle=angle,
+            kind=np.zeros(m, dtype=np.int64),
             code=np.concatenate([code, np.full(clutter, -1)]).astype(np.int64),
             message="",
         )

@@ -8,8 +8,9 @@ import pytest
 from robcal.imaging.detections import TargetKind
 from robcal.photogrammetry.bodies import Body
 from robcal.photogrammetry.camera import Camera, project
-from robcal.photogrammetry.identify_station import identify_station
-from robcal.photogrammetry.identify_targets import Prediction, identify_targets
+from robcal.photogrammetry.identify_station import identify_station, spread_order
+from robcal.photogrammetry.identify_targets import Prediction, identify_images, identify_targets
+from robcal.photogrammetry.resection import resect
 from robcal.transforms import exp_so3, frame, invert, retract, transform
 from tests.photogrammetry.stations import PLATE, simulate
 
@@ -118,3 +119,60 @@ def test_station_of_uncoded_dots():
     for key, image in result.images.items():
         assert np.array_equal(truth[key][image.rows], image.ids)
     assert sum(len(m) for m in result.marks.values()) >= 78
+
+
+def test_many_images_at_once_are_as_one_by_one():
+    rng = np.random.default_rng(6)
+    coded = np.arange(30) < 8
+    body = _body(np.column_stack([rng.uniform(-0.3, 0.3, (30, 2)), np.zeros(30)]), coded)
+    images, truths = [], []
+    for _ in range(5):
+        pose = frame(exp_so3(rng.uniform(-0.4, 0.4, 3)), [*rng.uniform(-0.1, 0.1, 2), 2.2])
+        d, truth = _detections(body, CAMERA, pose, coded, rng, 10)
+        images.append(d)
+        truths.append(truth)
+    images[3].code[:] = -1  # no code at all: by the prediction given
+    predictions = [(), (), (), (Prediction(pose_of(body, CAMERA, images[3], truths[3]), None, 4.0),), ()]
+    together = identify_images(images, body, ROUGH, predictions=predictions)
+    assert [image.method for image in together] == ["codes", "codes", "codes", "prediction", "codes"]
+    for d, truth, expected, image in zip(images, truths, predictions, together, strict=True):
+        alone = identify_targets(d, body, ROUGH, predictions=expected)
+        assert np.array_equal(np.sort(image.rows), np.sort(alone.rows))
+        assert np.array_equal(truth[image.rows], image.ids)
+
+
+def pose_of(body, camera, detections, truth):
+    """Pose from the true numbers, as another camera would predict it."""
+    rows = np.flatnonzero(truth >= 0)
+    fit = resect(camera, truth[rows], detections.xy[rows], detections.covariance[rows], body)
+    return retract(fit.camera_T_body, [0.001, -0.001, 0.002, 0.001, 0.001, -0.001])
+
+
+def test_second_round_finds_what_the_rough_cameras_missed():
+    rng = np.random.default_rng(7)
+    s = simulate(poses=8)
+    coded = np.arange(60) < 12
+    body = _body(np.column_stack([rng.uniform(-0.35, 0.35, (60, 2)), np.zeros(60)]), coded)
+    detections, truth = {}, {}
+    for name, camera in s.cameras.items():
+        detections[name] = {}
+        for pose in range(8):
+            T = invert(s.world_T_camera[name]) @ s.world_T_body[pose]
+            d, truth[name, pose] = _detections(body, camera, T, coded, rng, 20)
+            if (name, pose) == ("left", 3):
+                d.code[:] = -1
+            detections[name][pose] = d
+    result = identify_station(detections, body, s.rough)
+    image = result.images["left", 3]
+    assert image.method == "prediction"
+    for key, found in result.images.items():
+        assert np.array_equal(truth[key][found.rows], found.ids)
+        assert len(found.ids) >= 55
+
+
+def test_spread_order_takes_the_far_points_first():
+    points = np.array([[0.0, 0, 0], [0.1, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0], [0.5, 0.5, 0], [np.nan] * 3])
+    order = spread_order(points, np.isfinite(points).all(axis=1))
+    assert set(order[:4]) == {0, 2, 3, 4}
+    assert order[4] == 5
+    assert sorted(order) == [0, 1, 2, 3, 4, 5]

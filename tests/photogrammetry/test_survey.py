@@ -11,7 +11,7 @@ import pytest
 from robcal.errors import DegenerateGeometry, InvalidInput, NotIdentifiable
 from robcal.photogrammetry.bundle import AdjustSettings
 from robcal.photogrammetry.camera import Camera
-from robcal.photogrammetry.network import Lengths
+from robcal.photogrammetry.network import CameraNetwork, Lengths
 from robcal.photogrammetry.survey import BodyTarget, SurveyImage, SurveyResult, SurveySettings, survey_body
 from robcal.photogrammetry.survey_frame import fit_similarity
 from robcal.transforms import retract, transform
@@ -225,7 +225,7 @@ def test_useless_images_are_left_out_with_their_reason() -> None:
     black = SimpleNamespace(**{**vars(part(0)), "message": "the image is black"})
     noise = SimpleNamespace(
         xy=rng.uniform(50, 1700, (18, 2)), covariance=np.tile(np.eye(2) * 0.01, (18, 1, 1)),
-        semi_axes=np.full((18, 2), 8.0), code=np.arange(100, 118), message="",
+        semi_axes=np.full((18, 2), 8.0), angle=np.zeros(18), kind=np.zeros(18), code=np.arange(100, 118), message="",
     )  # fmt: skip
     extra = [
         SurveyImage("copy.png", images[3].detections),
@@ -252,6 +252,54 @@ def test_a_plate_of_circles_with_known_diameter() -> None:
     nees = e @ np.linalg.pinv(net.points_covariance, rcond=1e-10, hermitian=True) @ e / (e.size - 6)
     assert (net.radii == 0.015).all()
     assert 0.5 < nees < 1.6
+
+
+@pytest.mark.parametrize("stated", [True, False])
+def test_bars_whose_targets_state_no_diameter_do_not_bias_the_scale(stated: bool) -> None:
+    truth, rng = plate(31, coded=25, targets=25, diameter=0.05, sigma=0.01, images=20)
+    targets = [replace(t, diameter=None) if i < 2 and not stated else t for i, t in enumerate(listed(truth, 25))]
+    result = survey_body(detections(truth, 25, rng), targets, size=SIZE, scale_bars=bars(truth, (0, 1), sigma=1e-6))
+    net = result.network
+    e = aligned_error(net.points, truth.points, scale=False)
+    factor = 1.0 + np.sum(e * net.points) / np.sum((net.points - net.points.mean(axis=0)) ** 2)
+    assert abs(factor - 1.0) < 10e-6
+    np.testing.assert_allclose(net.radii, 0.025, rtol=0.01)
+
+
+def test_large_dots_on_the_faces_of_a_cube() -> None:
+    rng = np.random.default_rng(32)
+    truth = make_network(rng, "cube", images=50, targets=30, diameter=0.03, sigma=0.02)
+    result = survey_body(detections(truth, 30, rng), listed(truth, 30), size=SIZE, scale_bars=bars(truth, (0, 3)))
+    net = result.network
+    e = aligned_error(net.points, truth.points[net.ids - 100], scale=False).ravel()
+    nees = e @ np.linalg.pinv(net.points_covariance, rcond=1e-10, hermitian=True) @ e / (e.size - 6)
+    assert 0.5 < nees < 1.6
+    turned = np.abs(np.einsum("ti,ti->t", net.normals, _turned_normals(net, truth)))
+    assert np.degrees(np.arccos(np.clip(turned, 0, 1))).max() < 2.0
+
+
+def _turned_normals(net: CameraNetwork, truth: Truth) -> np.ndarray:
+    """The true normals in the frame of the surveyed body."""
+    rows = net.ids - 100
+    a, b = net.points - net.points.mean(axis=0), truth.points[rows] - truth.points[rows].mean(axis=0)
+    U, _, Vt = np.linalg.svd(a.T @ b)
+    turn = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
+    return np.asarray(truth.normals[rows] @ turn.T)
+
+
+def test_a_scale_that_contradicts_coordinates_or_sizes_is_a_wrong_unit() -> None:
+    truth, rng = plate(33, coded=20, targets=20, diameter=0.02, images=8)
+    images = detections(truth, 20, rng)
+    metres = bars(truth, (0, 1))
+    metres = Lengths(metres.ids, metres.length / 1000, metres.sigma)
+    with pytest.raises(InvalidInput, match=r"0\.001 times as large as its coordinates.*millimetres"):
+        survey_body(images, listed(truth, 20, xyz=True), size=SIZE, scale_bars=metres)
+    with pytest.raises(InvalidInput, match=r"0\.001 times as large as their diameters.*millimetres"):
+        survey_body(images, listed(truth, 20), size=SIZE, scale_bars=metres)
+    check = bars(truth, (2, 3))
+    check = Lengths(check.ids, check.length * 1000, check.sigma)
+    with pytest.raises(InvalidInput, match=r"check length 102-103.*0\.001 times.*millimetres"):
+        survey_body(images, listed(truth, 20), size=SIZE, scale_bars=bars(truth, (0, 1)), check_lengths=check)
 
 
 def test_errors_name_the_cause_and_the_remedy() -> None:

@@ -90,6 +90,42 @@ def test_a_small_slip_is_looked_for_where_the_fit_fails(tmp_path: Path) -> None:
         run_campaign(tmp_path / "campaign", tmp_path / "run", until="identify")
 
 
+def test_a_log_of_another_recording_is_refused(frame_campaign: Path, tmp_path: Path) -> None:
+    def only_the_first_joint(rows: Rows) -> None:
+        for row in rows:
+            row.update({name: rows[0][name] for name in JOINTS[1:]})
+
+    edit_rows(frame_campaign / "poses.csv", only_the_first_joint)
+    with pytest.raises(InvalidInput, match=r"even the identified robot misses .* no single slip"):
+        run_campaign(frame_campaign, tmp_path / "run", until="identify")
+
+
+def test_distances_in_metres(tmp_path: Path) -> None:
+    make_campaign(tmp_path / "campaign", seed=5, level="distances", poses=60, verify=6)
+
+    def metres(rows: Rows) -> None:
+        for row in rows:
+            row["distance_mm"] = str(float(row["distance_mm"]) / 1000)
+
+    edit_rows(tmp_path / "campaign" / "distances.csv", metres)
+    with pytest.raises(InvalidInput, match="must be in millimetres"):
+        run_campaign(tmp_path / "campaign", tmp_path / "run", until="identify")
+
+
+def test_two_poses_are_too_few_and_nothing_else_is_suspected(frame_campaign: Path, tmp_path: Path) -> None:
+    kept: set[str] = set()
+
+    def two(rows: Rows) -> Rows:
+        kept.update(row["pose"] for row in rows[:2])
+        return rows[:2]
+
+    edit_rows(frame_campaign / "poses.csv", two)
+    edit_rows(frame_campaign / "frames.csv", lambda rows: [row for row in rows if row["pose"] in kept])
+    edit_rows(frame_campaign / "poses.csv", lambda rows: [{**row, "set": "identify"} for row in rows])
+    with pytest.raises(NotIdentifiable, match="measure"):
+        run_campaign(frame_campaign, tmp_path / "run", until="identify")
+
+
 def test_a_sound_log_passes(frame_campaign: Path, tmp_path: Path) -> None:
     done = run_campaign(frame_campaign, tmp_path / "run", until="identify")
     assert done.ran == ("identify",)

@@ -1,0 +1,118 @@
+"""Irregular error curves of joints: found, alike where they are, and not taken for what has a name."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from robcal.calibration.identification import identify
+from robcal.calibration.observations import FrameObservations
+from robcal.diagnosis.curves import LEAST_POSES, curve, find_curves, likenesses, nested_errors
+from robcal.diagnosis.diagnose import diagnose
+from robcal.diagnosis.empirical import periodic_curve
+from robcal.diagnosis.recording import Accepted, Fit, Recording, fit, terms_of
+from robcal.physics.site import Joint
+from tests.calibration.scenarios import Scenario, scenario
+
+ORDERS = np.arange(3, 25)
+
+
+def pattern(seed: int, angle: np.ndarray, size: float = 3e-4) -> np.ndarray:
+    """An irregular curve with period one turn and an RMS of `size`."""
+    rng = np.random.default_rng(seed)
+    a, b = rng.normal(size=(2, len(ORDERS)))
+    y = np.cos(np.outer(angle, ORDERS)) @ a + np.sin(np.outer(angle, ORDERS)) @ b
+    return np.asarray(size * y / np.sqrt(len(ORDERS)))
+
+
+def recorded(wrong_q: np.ndarray, s: Scenario, sigma: float = 3e-5) -> tuple[Recording, FrameObservations]:
+    obs = s.frames(s.poses.with_q(wrong_q), sigma, 2 * sigma)
+    n = len(wrong_q)
+    covariates = {"index": np.arange(n, dtype=float)}
+    names = tuple(f"p{i}" for i in range(n))
+    return Recording(s.poses.q, ("dumbbell",) * n, covariates, names, obs), obs
+
+
+def fitted(recording: Recording, obs: FrameObservations, s: Scenario) -> Fit:
+    found = identify(s.model, s.poses, [obs], kernel=s.kernel)
+    return fit(found.model, recording, found.names)
+
+
+@pytest.fixture(scope="module")
+def uneven() -> tuple[Recording, Fit, np.ndarray]:
+    """Every joint has the same uneven pitch, turned; the third is mounted the other way round."""
+    s = scenario(3, n=400)
+    q = s.poses.q
+    added = np.stack([pattern(1, q[:, k] + 0.7 * k) for k in range(q.shape[1])], axis=1)
+    added[:, 2] = -pattern(1, -q[:, 2] + 1.0)
+    recording, obs = recorded(q + added, s)
+    return recording, fitted(recording, obs, s), added
+
+
+def test_curves_of_all_joints_are_found(uneven: tuple[Recording, Fit, np.ndarray]) -> None:
+    recording, present, added = uneven
+    found = find_curves(present, recording)
+    assert [item.family.where for item in found.accepted] == [f"axis{k}" for k in range(1, 7)]
+    assert found.p_value < 1e-100
+    errors = nested_errors(present, recording, found.accepted, None)
+    assert len(errors) == 7
+    assert errors[-1] < 0.4 * errors[0]
+    for k, item in enumerate(found.accepted):
+        q = recording.q[:, k]
+        slow = np.vander(q, 5)  # zero offsets and slow waves are also geometry
+        truth, told = (y - slow @ np.linalg.lstsq(slow, y, rcond=None)[0] for y in (added[:, k], curve(item, q)))
+        assert np.corrcoef(truth, told)[0, 1] > 0.9
+
+
+def test_likeness_tells_turn_and_sense() -> None:
+    q = np.linspace(-np.pi, np.pi, 500)
+    items = []
+    for k, law in ((1, pattern(5, q)), (2, pattern(5, q + 1.0)), (3, -pattern(5, -q + 2.0)), (4, pattern(6, q))):
+        family = periodic_curve(Joint(k, f"axis{k}", "z", 1, False), q, 72)
+        laws = np.stack([b.value({f"q{k}": q}) for b in family.bases(family.grid[0])], axis=1)  # type: ignore[misc]
+        values = np.linalg.lstsq(laws, law, rcond=1e-8)[0]
+        items.append(Accepted(family, family.grid[0], values, np.zeros((72, 72))))
+    found = {like.joint: like for like in likenesses(items, [q] * 4)}
+    assert set(found) == {"axis2", "axis3"}
+    assert (found["axis2"].other, found["axis2"].sense) == ("axis1", 1)
+    assert found["axis2"].shift == pytest.approx(1.0, abs=0.02)
+    assert found["axis3"].sense == -1
+    by = {"axis1": 2.0, "axis2": 1.0}[found["axis3"].other]
+    assert found["axis3"].shift == pytest.approx(by, abs=0.02)
+
+
+def test_nothing_and_what_has_a_name_are_left_alone() -> None:
+    s = scenario(4, n=200)
+    q = s.poses.q
+    recording, obs = recorded(q, s)
+    assert not find_curves(fitted(recording, obs, s), recording).accepted
+    wave = q.copy()
+    wave[:, 1] += 4e-4 * np.cos(17 * q[:, 1])
+    recording, obs = recorded(wave, s)
+    assert not find_curves(fitted(recording, obs, s), recording).accepted
+
+
+def test_few_poses_tell_no_curves(uneven: tuple[Recording, Fit, np.ndarray]) -> None:
+    recording, present, _ = uneven
+    short = recording.subset(np.arange(len(recording.q)) < LEAST_POSES - 1)
+    assert not find_curves(present, short).accepted
+
+
+def test_long_laws_become_several_terms_with_priors() -> None:
+    q = np.linspace(-3, 3, 100)
+    family = periodic_curve(Joint(2, "axis2", "z", 1, False), q, 72)
+    count = len(family.names(family.grid[0]))
+    terms = terms_of(Accepted(family, family.grid[0], np.arange(count) * 1e-5, np.zeros((count, count))), 0)
+    assert len(terms) == 3
+    assert sum(len(t.priors) for t in terms) == count
+    assert [v for t in terms for v in t.parameters.values()] == pytest.approx(np.arange(count) * 1e-5)
+
+
+def test_diagnosis_models_the_curves(uneven: tuple[Recording, Fit, np.ndarray]) -> None:
+    recording, present, added = uneven
+    told = diagnose(present.model, recording, present.free)
+    curves = [f for f in told.findings if "period_deg" in f.parameters]
+    assert [f.family.where for f in curves] == [f"axis{k}" for k in range(1, 7)]
+    assert told.heldout[1] < 0.4 * told.heldout[0]
+    assert told.joint_sigma < 0.5 * np.std(added)
+    assert "turned by" in " ".join(f.statement for f in curves)
