@@ -108,7 +108,7 @@ def predicted(calibrated: Calibrated, poses: Poses, *, nominal: bool = False) ->
     inputs = inputs_to_predict(calibrated, kernel, poses)
     if nominal:
         return kernel.frames(kernel.theta0, inputs), None
-    columns = [kernel.index[name] for name in calibrated.names]
+    columns = np.array([kernel.index[name] for name in calibrated.names], dtype=np.intp)
     T, J = kernel.frames_and_jacobian(kernel.theta0, inputs, columns)
     covariance = J @ calibrated.covariance @ np.swapaxes(J, 1, 2)
     if calibrated.joint_sigma > 0.0:

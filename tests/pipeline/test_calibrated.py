@@ -39,7 +39,9 @@ def test_joint_scatter_is_part_of_what_a_prediction_may_miss() -> None:
     calibrated = Calibrated(model, model, "one_step", (), np.zeros((0, 0)), q, np.tile(np.eye(4), (4, 1, 1)))
     T, without = predicted(calibrated, poses)
     _, covariance = predicted(replace(calibrated, joint_sigma=1e-4), poses)
-    assert without is not None and covariance is not None and not without.any()
+    assert without is not None
+    assert covariance is not None
+    assert not without.any()
     rng = np.random.default_rng(4)
     samples = [kernel.frames(kernel.theta0, kernel.poses(q + 1e-4 * rng.normal(size=q.shape))) for _ in range(4000)]
     moved = np.stack([np.linalg.inv(T) @ S for S in samples])[:, :, :3, 3]
