@@ -197,7 +197,7 @@ def main() -> None:
     if options.what in ("accuracy", "all"):
         accuracy(max(2, 20 // share))
     if options.what in ("time", "all"):
-        timing(10)
+        timing(60)
     if options.what in ("convergence", "all"):
         convergence(1000 // share)
     if options.what in ("coverage", "all"):
