@@ -103,9 +103,10 @@ def collect(images: Sequence[SurveyImage], targets: Sequence[BodyTarget], length
         columns.append((xy, covariance, axes, angle, codes))
     if len(names) < 2:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in unused[:5])
+        told = f" ({reasons})" if reasons else ""
         raise DegenerateGeometry(
-            f"only {len(names)} of {len(images)} images can be used ({reasons or 'none given'}): a survey needs "
-            "at least three, better twenty from all sides"
+            f"only {len(names)} of {len(images)} images can be used{told}: a survey needs at least three, better "
+            "twenty from all sides"
         )
     often = {code: count for code, count in unknown_codes.items() if count >= 3}
     if often:

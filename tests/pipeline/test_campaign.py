@@ -176,6 +176,11 @@ def test_a_ring_id_that_no_ring_shows(image_campaign: Path) -> None:
     assert "302 is no ring12 id" in refused(image_campaign)
 
 
+def test_a_normal_that_is_no_direction(point_campaign: Path) -> None:
+    edit_yaml(point_campaign / "plate.yaml", lambda d: d["targets"][1].update(normal=[0.0, 0.0, 0.0]))
+    assert "it is a direction of length 1" in refused(point_campaign)
+
+
 def test_bodies_of_contradictory_targets(point_campaign: Path) -> None:
     edit_yaml(point_campaign / "plate.yaml", lambda d: d["targets"].append(dict(d["targets"][0])))
     assert "stands twice" in refused(point_campaign)
