@@ -41,15 +41,16 @@ def estimate_noise(
     """Estimate both components at the fit of the given model."""
     plain = replace(recording, shared=None, common=None)
     present = fit(model, plain, free, accepted)
-    # errors common to all poses are projected out like parameters
-    nuisance = None if recording.common is None else plain.whiten(recording.common, present.frames)
-    return restricted_likelihood(present, plain, nuisance)
+    common = None if recording.common is None else plain.whiten(recording.common, present.frames)
+    return restricted_likelihood(present, plain, common)
 
 
-def restricted_likelihood(present: Fit, recording: Recording, nuisance: Array | None = None) -> Noise:
+def restricted_likelihood(present: Fit, recording: Recording, common: Array | None = None) -> Noise:
     """Maximise the restricted likelihood over the ratio of the components; the common factor follows in closed form.
 
-    `recording` must be whitened by its stated covariance alone; `nuisance` (m, k) are further columns to project out.
+    `recording` must be whitened by its stated covariance alone; `common` (m, k) are whitened displacements by one
+    standard deviation of errors that all poses share: random numbers of unit variance, so each enters as an unknown
+    that was observed to be zero (Henderson's mixed model equations).
     """
     joints = present.kernel.joint_jacobian(present.theta, present.inputs)
     _, flat = recording.observations.linearise(present.frames, joints)
@@ -57,7 +58,7 @@ def restricted_likelihood(present: Fit, recording: Recording, nuisance: Array | 
     per = len(flat) // observations
     moved = flat.reshape(observations, per, -1)
     residual = present.residual.reshape(observations, per)
-    absorbed = present.jacobian if nuisance is None else np.column_stack([present.jacobian, nuisance])
+    absorbed = present.jacobian if common is None else np.column_stack([present.jacobian, common])
     jacobian = absorbed.reshape(observations, per, -1)
     order = np.argsort(recording.observations.pose, kind="stable")
     pose = recording.observations.pose[order]
@@ -70,6 +71,10 @@ def restricted_likelihood(present: Fit, recording: Recording, nuisance: Array | 
     values = np.clip(np.concatenate([b[0] for b in blocks]), 0.0, None)
     r = np.concatenate([b[1] for b in blocks])
     J = np.concatenate([b[2] for b in blocks])
+    if common is not None:
+        shared, fitted = common.shape[1], present.jacobian.shape[1]
+        values, r = (np.concatenate([known, np.zeros(shared)]) for known in (values, r))
+        J = np.vstack([J, np.eye(shared, fitted + shared, fitted)])
     U, s, _ = np.linalg.svd(J / np.maximum(np.linalg.norm(J, axis=0), 1e-300), full_matrices=False)
     J = U[:, s > 1e-9 * s[0]]
     freedom = len(r) - J.shape[1]
@@ -82,7 +87,7 @@ def restricted_likelihood(present: Fit, recording: Recording, nuisance: Array | 
         log_det = float(np.linalg.slogdet(normal)[1])
         return freedom * np.log(variance) - float(np.sum(np.log(weight))) + log_det, variance
 
-    scale = -np.log(max(float(np.mean(values)), 1e-300))
+    scale = -np.log(max(float(np.mean(values[: len(present.residual)])), 1e-300))
     none = profile(-700.0)
     found = optimize.minimize_scalar(
         lambda x: profile(x)[0], bounds=(scale - 8.0, scale + 6.0), method="bounded", options={"xatol": 0.02}
