@@ -52,17 +52,19 @@ def _answers(command: str, as_json: bool) -> Iterator[dict[str, Any]]:
     except MemoryError:
         _fail(command, as_json, "not enough memory: use smaller images or fewer at once")
     except Exception as error:
-        with tempfile.NamedTemporaryFile("w", prefix="robcal-", suffix=".log", delete=False) as stream:
+        with tempfile.NamedTemporaryFile(
+            "w", prefix="robcal-", suffix=".log", delete=False, encoding="utf-8", errors="backslashreplace"
+        ) as stream:
             stream.write(traceback.format_exc())
         _fail(command, as_json, f"internal error ({type(error).__name__}): the traceback is in {stream.name}")
     if as_json:
-        typer.echo(json.dumps(plain({"ok": True, "command": command, **answer}), ensure_ascii=False))
+        typer.echo(json.dumps(plain({"ok": True, "command": command, **answer})))
 
 
 def _fail(command: str, as_json: bool, sentence: str) -> None:
     typer.echo(f"error: {sentence}", err=True)
     if as_json:
-        typer.echo(json.dumps({"ok": False, "command": command, "error": sentence}, ensure_ascii=False))
+        typer.echo(json.dumps({"ok": False, "command": command, "error": sentence}))
     raise typer.Exit(1)
 
 

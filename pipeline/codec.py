@@ -159,4 +159,5 @@ def load(path: Path) -> Any:
         structure = json.loads(arrays.pop(_STRUCTURE).tobytes().decode())
         return decode(structure, arrays)
     except (OSError, ValueError, KeyError, TypeError, AttributeError, ImportError, zipfile.BadZipFile) as error:
-        raise StaleCache(f"{path}: cannot be read back ({error}): run the campaign again") from None
+        reason = "damaged" if isinstance(error, zipfile.BadZipFile | OSError) or "pickle" in str(error) else str(error)
+        raise StaleCache(f"{path}: cannot be read back ({reason}): run the campaign again") from None

@@ -94,5 +94,5 @@ def write_atomic(path: Path, write: Callable[[BinaryIO], object]) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write UTF-8 text atomically."""
-    write_atomic(path, lambda stream: stream.write(text.encode()))
+    """Write UTF-8 text atomically; file names that are no text (bytes of another encoding) are spelt out."""
+    write_atomic(path, lambda stream: stream.write(text.encode("utf-8", "backslashreplace")))

@@ -46,7 +46,7 @@ class Messages:
             return
         stamp = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
         try:
-            with self.log.open("a", encoding="utf-8") as stream:
+            with self.log.open("a", encoding="utf-8", errors="backslashreplace") as stream:
                 stream.write("".join(f"{stamp} {line}\n" for line in text.splitlines() or [""]))
         except OSError as error:
             raise storage_error(self.log, error) from None

@@ -31,6 +31,8 @@ from robcal.robot.kernel import Kernel
 from robcal.robot.model import RobotModel
 
 MOST = 3
+BEYOND_DOUBT = 1e4
+"""Chi-square of a movement from which nothing else can be meant: a plate that grows reaches some thousands."""
 DECIDED = 12.0
 """Difference of the robot's misfits (chi-square) from which the other camera is excluded: odds of 400."""
 REPEATED = 5
@@ -39,27 +41,37 @@ Orient = Callable[[StationSettings], StationOrientation]
 
 
 def with_small_moves(
-    orientation: StationOrientation, orient: Orient, data: Callable[[StationOrientation], ImageData]
-) -> StationOrientation:
-    """The station with an epoch for each further camera movement that the diagnosis of the images finds.
+    orient: Orient, data: Callable[[StationOrientation], ImageData]
+) -> tuple[StationOrientation, Orient]:
+    """The station with an epoch for each camera movement that the diagnosis of the images finds.
+
+    Also returns how to orient it again: moves that the adjustment took for such and the diagnosis, which knows the
+    alternatives, for something else are not looked for any more.
 
     Parameters
     ----------
     orient : orientation with given settings. data : the diagnosis' view of an orientation.
     """
+    orientation = orient(StationSettings())
+    if len(orientation.names) < 2:
+        return orientation, orient
+    moved = [e for e in orientation.evidence if e.kind == "camera_moved"]
+    if moved and max(e.statistic for e in moved) < BEYOND_DOUBT:
+        at_rest = orient(StationSettings(detect_moves=False))
+        causes = {f.cause for f in diagnose_images(data(at_rest)).findings}
+        if causes and "camera_moved" not in causes:
+            return at_rest, lambda settings: orient(replace(settings, detect_moves=False))
     for _ in range(MOST):
-        if len(orientation.names) < 2:
-            break
         view = data(orientation)
-        moved = next((f for f in diagnose_images(view).findings if f.cause == "camera_moved"), None)
-        if moved is None:
+        found = next((f for f in diagnose_images(view).findings if f.cause == "camera_moved"), None)
+        if found is None:
             break
-        pose = int(orientation.poses[view.image_names.index(str(moved.parameters["pose"]))])
+        pose = int(orientation.poses[view.image_names.index(str(found.parameters["pose"]))])
         try:
-            orientation = _oriented(orient, orientation, _with(epochs_of(orientation), moved.where, pose))
+            orientation = _oriented(orient, orientation, _with(epochs_of(orientation), found.where, pose))
         except RobcalError:  # an epoch with too few marks cannot be adjusted
             break
-    return orientation
+    return orientation, orient
 
 
 def epochs_of(orientation: StationOrientation) -> dict[str, tuple[int, ...]]:

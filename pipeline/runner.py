@@ -219,7 +219,7 @@ def stage_key(stage: Stage, context: Context, applying: Sequence[str]) -> str:
     """Hash of everything that the result of a stage depends on."""
     run, campaign = context.run, context.campaign
     home = campaign.path.parent.absolute()
-    files = {os.path.relpath(path.absolute(), home): run.hash(path) for path in stage.inputs(campaign)}
+    files = {_name_within(path, home): run.hash(path) for path in stage.inputs(campaign)}
     upstream = {}
     for name in stage.after:
         record = run.record(name) if name in applying else None
@@ -227,6 +227,14 @@ def stage_key(stage: Stage, context: Context, applying: Sequence[str]) -> str:
     # the index of images holds their places; everything else is the same wherever the campaign lies
     alone = context.body if stage.name == "survey" else str(home) if stage.name == "detect" else None
     return fingerprint(stage.name, files, stage.settings(campaign), upstream, code_version(*stage.code), alone)
+
+
+def _name_within(path: Path, home: Path) -> str:
+    """A file's place seen from the campaign; on another drive its full place."""
+    try:
+        return Path(os.path.relpath(path.absolute(), home)).as_posix()
+    except ValueError:
+        return str(path.absolute())
 
 
 def collect_result(run: Run, campaign: Campaign, names: Sequence[str]) -> dict[str, Any]:

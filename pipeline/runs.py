@@ -208,7 +208,7 @@ class Run:
 
     def outputs(self, paths: Sequence[Path]) -> dict[str, str]:
         """Names and hashes of files of this run."""
-        return {str(path.relative_to(self.folder)): self.hash(path) for path in paths}
+        return {path.relative_to(self.folder).as_posix(): self.hash(path) for path in paths}
 
     def hash(self, path: Path) -> str:
         """SHA-256 of a file; remembered while size and time of change stay the same."""
@@ -305,7 +305,10 @@ def _plain(name: str) -> str:
 
 def write_json(path: Path, data: Mapping[str, Any]) -> None:
     """Write JSON atomically; numbers that are not finite become null."""
-    write_text(path, json.dumps(plain(data), indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+    text = json.dumps(plain(data), indent=1, ensure_ascii=False, allow_nan=False)
+    if any("\ud800" <= c <= "\udfff" for c in text):  # a file name in another encoding: only escapes bring it back
+        text = json.dumps(plain(data), indent=1, allow_nan=False)
+    write_text(path, text + "\n")
 
 
 def read_json(path: Path) -> dict[str, Any]:

@@ -35,12 +35,14 @@ class TerminationSettings:
     max_iterations : Gauss-Newton steps at most.
     max_halvings : halvings of one step at most.
     cost_tolerance : stop when a step lowers, or promises to lower, half the sum of squares by less than this fraction
-        of it (plus the same fraction of one).
+        of it (plus the same fraction of one),
+    negligible : or by less than this, for whitened residuals: 1e-4 are 0.014 standard deviations of one parameter.
     """
 
     max_iterations: int = 30
     max_halvings: int = 12
     cost_tolerance: float = 1e-8
+    negligible: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -128,7 +130,7 @@ def gauss_newton(
         step = solve_step(r, J, None if usual is None else room * usual)
         predicted = J @ step
         promise = float(r @ predicted - 0.5 * predicted @ predicted)
-        small = settings.cost_tolerance * (1.0 + cost)
+        small = max(settings.cost_tolerance * (1.0 + cost), settings.negligible)
         if promise <= small:
             return state, summary(True, "a further step would not lower the cost")
         length = 1.0

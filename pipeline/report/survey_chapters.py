@@ -38,6 +38,7 @@ def _survey(name: str, survey: SurveyResult) -> list[Block]:
         ["marks", str(len(n.marks)), f"{len(n.rejected)} rejected"],
         ["sigma0", number(n.sigma0), f"{number(n.sigma0_px)} px a coordinate"],
         ["redundancy", str(n.redundancy_total), f"weakest mark {np.min(n.redundancy):.2f}" if len(n.marks) else ""],
+        ["rank", str(n.rank), f"of {n.unknowns} unknowns, the datum adds the rest; condition {n.condition:.1e}"],
         ["sigma of a target (mm)", number(np.sqrt(np.mean(sigma**2))), f"largest {number(np.max(sigma))}"],
         ["datum", n.datum, survey.frame],
         ["scale", survey.scale, ""],

@@ -63,10 +63,11 @@ def work(context: Context) -> Outcome:
         return station_data(orientation, poses.names, body, start, image_covariates(campaign))
 
     try:
-        orientation = orient(StationSettings())
         if campaign.entry.diagnosis.enabled:
-            orientation = with_small_moves(orientation, orient, data)
-            orientation = which_moved(orientation, orient, campaign, marks)
+            orientation, again = with_small_moves(orient, data)
+            orientation = which_moved(orientation, again, campaign, marks)
+        else:
+            orientation = orient(StationSettings())
     except RobcalError as error:
         raise located(error, f"{campaign.path}: station") from None
     outputs = [run.save(NAME, orientation), run.save("marks", marks)]

@@ -229,6 +229,21 @@ def _result(done: SurveyResult) -> dict[str, Any]:
         "length_error_mm": max((abs(c.error) for c in checked), default=float("nan")) * 1000,
         "sigma0": network.sigma0,
         "redundancy": network.redundancy_total,
+        "unknowns": network.unknowns,
+        "rank": network.rank,
+        "datum": network.datum,
+        "condition": network.condition,
+        "correlated": [[c.first, c.second, c.value] for c in network.correlations],
+        "lengths": [
+            {
+                "targets": list(c.ids),
+                "kind": c.kind,
+                "stated_mm": c.expected * 1000,
+                "error_mm": c.error * 1000,
+                "sigma_mm": c.sigma * 1000,
+            }
+            for c in (*network.check_lengths, *network.scale_bars)
+        ],
         "marks": len(network.marks),
         "rejected": len(network.rejected),
         "sigma_mm": float(np.sqrt(np.mean(network.points_sigma**2)) * 1000),

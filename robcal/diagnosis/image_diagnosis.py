@@ -15,7 +15,9 @@ from robcal.diagnosis.image_data import ImageData
 from robcal.diagnosis.scan import Entry, ScanResult, Stack, log_f_probability, orthonormal_basis, scan, stack_entries
 from robcal.physics.family import Array, Constants, numeric_sigma
 
-LEVEL = 0.01
+LEVEL = 0.002
+"""Family-wise level. Marks share small errors that their covariance does not know, and a robot's own diagnosis adds its
+false alarms to these."""
 MOST = 5
 RUNS = 200
 NEARLY_AS_GOOD = 3.0

@@ -14,6 +14,7 @@ from robcal.photogrammetry.determinacy import strong_correlations
 from robcal.photogrammetry.lengths import distances, length_results
 from robcal.photogrammetry.network import CameraNetwork, Lengths, RejectedMark, frozen
 from robcal.photogrammetry.snooping import reliability, test_statistics, variance_factors
+from robcal.transforms import Array
 
 _BARS_REDUNDANCY = 5.0
 """Redundancy of the scale bars from which on their variance is estimated."""
@@ -127,9 +128,20 @@ def finish(
         check_lengths=length_results(check_lengths, ids, state.points, Q[k:, k:], "check"),
         datum=problem.datum.words,
         condition=_condition(factor),
+        unknowns=6 * problem.order.images + len(factor.free),
+        rank=6 * problem.order.images + numerical_rank(factor.equilibrated),
         summary=summary,
         notes=notes,
     )
+
+
+def numerical_rank(equilibrated: Array) -> int:
+    """Rank of the reduced normal equations (a, a) with unit scale: eigenvalues above their rounding errors.
+
+    Without its datum a free network lacks 6, or 7 where no length gives the scale.
+    """
+    values = np.linalg.eigvalsh(equilibrated)
+    return int(np.count_nonzero(values > 10.0 * len(values) * np.finfo(float).eps * values[-1]))
 
 
 def _condition(factor: Factor) -> float:

@@ -194,6 +194,8 @@ class CameraNetwork:
     redundancy_total : observations minus unknowns plus datum defect.
     rejected : marks taken out; correlations : pairs of unknowns above 0.95.
     scale_bars, check_lengths : results per length; datum : what fixes the frame, in words.
+    unknowns : how many are estimated; rank : numerical rank of the normal equations without the datum, so ``unknowns``
+        minus its defect (7, with scale bars 6, with fixed targets 0) where the marks determine everything.
     summary : iterations and seconds of all minimisations together; costs and termination of the last one.
     """
 
@@ -226,6 +228,8 @@ class CameraNetwork:
     check_lengths: tuple[LengthResult, ...]
     datum: str
     condition: float
+    unknowns: int
+    rank: int
     summary: SolveSummary
     notes: tuple[str, ...] = field(default=())
 

@@ -89,6 +89,10 @@ def resect_station(
     return starts, failed
 
 
+LEAST_MISFIT = 0.25
+"""Mean square misfit, in the errors that start values may cause, below which no targets are exchanged."""
+
+
 def find_swap(
     marks: Sequence[StationMarks], cameras: Sequence[Camera], body: Body, sigma_px: float, images: Sequence[ImageStart]
 ) -> tuple[int, int] | None:
@@ -100,8 +104,8 @@ def find_swap(
     known = np.flatnonzero(body.known)
     if not 4 <= len(known) <= 12:
         return None
-    richest = sorted(images, key=lambda s: -len(s.rows))[:8]
-    if not richest or np.median([s.resection.chi2 / max(1, s.resection.redundancy) for s in richest]) < 25.0:
+    richest = sorted(images, key=lambda s: -int(np.sum(marks[s.camera].pose == s.pose)))[:8]
+    if not richest:
         return None
 
     def misfit(trial: Body) -> float:
@@ -116,7 +120,9 @@ def find_swap(
             values.append(fit.chi2 / max(1, fit.redundancy) if isinstance(fit, Resection) else 1e12)
         return float(np.median(values))
 
-    before = misfit(body)
+    before = misfit(body)  # a body of few targets fits fairly well with two exchanged, in a mirrored pose
+    if before < LEAST_MISFIT:
+        return None
     trials = [(misfit(exchanged(body, int(i), int(j))), int(i), int(j)) for i, j in combinations(known, 2)]
     after, i, j = min(trials)
     return (i, j) if after < 4.0 and after < 0.02 * before else None

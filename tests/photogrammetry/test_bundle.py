@@ -399,3 +399,16 @@ def test_a_start_far_away_still_converges_with_damping() -> None:
     assert summary.converged
     assert abs(state.camera.fx / c.fx - 1.0) < 0.01
     assert summary.history[-1] < 1e-3 * summary.history[0]
+
+
+def test_rank_tells_the_datum_defect() -> None:
+    rng = np.random.default_rng(61)
+    truth = make_network(rng, images=10, targets=20)
+    bars = Lengths([[0, 19]], [length_of(truth, 0, 19)], [1e-5])
+    free = adjusted(truth, rng)
+    scaled = adjusted(truth, rng, lengths=bars)
+    assert free.unknowns == scaled.unknowns == 9 + 6 * 10 + 3 * 20
+    assert free.unknowns - free.rank == 7
+    assert scaled.unknowns - scaled.rank == 6
+    held = adjust(truth.marks, *near(truth, rng)[:2], truth.points, datum=(0, 7, 19))
+    assert held.rank == held.unknowns == 9 + 6 * 10 + 3 * 17

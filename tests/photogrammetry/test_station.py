@@ -6,12 +6,15 @@ import numpy as np
 import pytest
 
 from robcal.errors import DegenerateGeometry, InvalidInput
+from robcal.photogrammetry.bodies import Body
+from robcal.photogrammetry.camera import Camera, project
 from robcal.photogrammetry.measure_points import measure_points
 from robcal.photogrammetry.station import orient_station
 from robcal.photogrammetry.station_adjustment import global_columns, linearise
 from robcal.photogrammetry.station_network import StationMarks, StationSettings, Unknowns
 from robcal.photogrammetry.station_scan import score_columns
-from robcal.transforms import retract, transform
+from robcal.photogrammetry.station_start import find_swap, resect_station
+from robcal.transforms import exp_so3, frame, retract, transform
 from tests.photogrammetry.stations import SIZE, Station, nees, simulate
 
 
@@ -181,3 +184,25 @@ def test_score_of_a_missing_lens_term_is_its_estimate():
     assert found.degrees == 2
     assert found.statistic > 30
     assert np.allclose(found.estimate, [2e-4, -1e-4], atol=8e-5)
+
+
+def test_exchanged_targets_that_mirror_a_small_plate_are_found() -> None:
+    # corners of a square across its diagonal: most images still fit, mirrored, within what start values may cause
+    points = 0.5 * np.array(
+        [[-0.2, -0.18, 0.0], [0.21, -0.17, 0.03], [0.19, 0.2, 0.0], [-0.18, 0.21, 0.05], [0.02, 0.01, 0.11]]
+    )
+    ids = np.array([17, 151, 343, 727, 1003])
+    body = Body("plate", ids, points, covariance=np.eye(15) * 1e-12)
+    camera = Camera(4096, 3072, 3000.0, 3000.0, 2048.0, 1536.0)
+    rng = np.random.default_rng(2)
+    pose, target, xy = [], [], []
+    for p in range(12):
+        turn = exp_so3(rng.normal(0, 0.3, 3)) @ np.diag([1.0, -1.0, -1.0])
+        T = frame(turn, np.array([0.1, 0.05, 1.3]) + rng.normal(0, 0.05, 3))
+        pose += [p] * 5
+        target += [17, 727, 343, 151, 1003]  # 151 and 727 exchanged
+        xy.append(project(camera, transform(np.tile(T, (5, 1, 1)), points)))
+    covariance = np.tile(0.05**2 * np.eye(2), (len(pose), 1, 1))
+    marks = StationMarks(np.array(pose), np.array(target), np.concatenate(xy), covariance)
+    images, _ = resect_station(("only",), [marks], [camera], body, 5.0)
+    assert find_swap([marks], [camera], body, 5.0, images) in ((1, 3), (3, 1))

@@ -338,6 +338,18 @@ def test_backslashes_of_windows_in_paths(image_campaign: Path, detected: Path) -
     assert command(image_campaign, detected, "--until", "detect")[0] == 0
 
 
+@pytest.mark.skipif(os.name == "nt", reason="file names are text there")
+def test_folder_name_in_another_encoding(frame_campaign: Path, tmp_path: Path) -> None:
+    folder = Path(os.fsdecode(os.fsencode(tmp_path) + b"/Anlage-K\xf6ln"))
+    shutil.move(frame_campaign, folder)
+    out = folder.parent / f"{folder.name}-run"
+    for _ in range(2):
+        done = runner.invoke(app, ["run", str(folder), "--out", str(out), "--until", "verify", "--json"])
+        assert done.exit_code == 0, done.output
+    assert "verify: up to date" in done.stderr
+    assert runner.invoke(app, ["report", str(out), "-q"]).exit_code == 0
+
+
 def test_relative_paths_from_another_folder(point_campaign: Path, tmp_path: Path) -> None:
     away = tmp_path / "away"
     away.mkdir()
