@@ -1,6 +1,6 @@
 """Identification against an oracle and peers: accuracy, time, convergence, coverage.
 
-Usage: ``python -m benchmarks.identification [accuracy|time|convergence|coverage|peers|all] [--quick]``
+Usage: ``python -m benchmarks.identification [accuracy|time|convergence|coverage|agreement|peers|all] [--quick]``
 
 Setting: a 125 kg class arm with six errors a frame, 80 poses in 6D with 0.05 mm and 0.1 mrad noise, base and tool
 unknown, base tilted by 22 mrad, 500 noise-free kept-out poses. The oracle knows which parameters are not zero.
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from dataclasses import replace
 
 import numpy as np
 from scipy import stats
@@ -17,6 +18,7 @@ from scipy import stats
 from benchmarks.robots import Truth, kr125_like, measured, random_poses, table, true_robot
 from robcal import transforms as tf
 from robcal.calibration.identification import IdentifiedRobot, IdentifyOptions, identify, predict_frames
+from robcal.calibration.observations import Observations, PointObservations
 from robcal.robot.kernel import Kernel, PoseInputs
 
 
@@ -139,6 +141,52 @@ def coverage(runs: int) -> None:
           [[name, len(v), 100.0 * float(np.mean(v))] for name, v in inside.items()])
 
 
+def _only(observed: Observations, wanted: np.ndarray, rows: np.ndarray) -> Observations:
+    """Observations of the wanted poses, numbered as in rows."""
+    part = observed.subset(wanted)
+    at = {int(row): k for k, row in enumerate(rows)}
+    return replace(part, pose=np.array([at[int(wanted[k])] for k in part.pose], dtype=np.int64))  # type: ignore[no-any-return]
+
+
+def agreement(seeds: int) -> None:
+    """3D (one target a pose, twice the poses), 6D and a mixture of both of one robot: do they agree as they claim?"""
+    kernel = Kernel(kr125_like())
+    errors: dict[str, list[float]] = {"6D, 80 poses": [], "3D, 160 other poses": [], "mixture, 40 + 80 poses": []}
+    squares: list[float] = []
+    inside: list[bool] = []
+    for seed in range(seeds):
+        rng = np.random.default_rng(seed)
+        truth = true_robot(kernel, rng, True)
+        poses, kept_out = random_poses(kernel, rng, 240), random_poses(kernel, rng, 100)
+        frames = measured(truth, poses, rng)
+        n = len(poses)
+        p = truth.frames(poses)[:, :3, 3] + 5e-5 * rng.normal(size=(n, 3))
+        points = PointObservations(
+            np.arange(n), np.zeros((n, 3)), p, np.broadcast_to(25e-10 * np.eye(3), (n, 3, 3)), np.zeros(n)
+        )
+        sets = (  # rows measured in 6D, rows measured in 3D
+            (np.arange(80), np.arange(0)), (np.arange(0), np.arange(80, 240)), (np.arange(40), np.arange(80, 160)),
+        )
+        robots = []
+        for in_6d, in_3d in sets:
+            rows = np.concatenate([in_6d, in_3d])
+            observed = [o for o in (_only(frames, in_6d, rows), _only(points, in_3d, rows)) if len(o.pose)]
+            robots.append(identify(kernel.model, poses.subset(rows), observed, kernel=kernel))
+        for out, robot in zip(errors.values(), robots, strict=True):
+            out.append(mean_error(robot, truth, kept_out))
+        (T6, C6), (T3, C3) = (predict_frames(robot, kept_out) for robot in robots[:2])
+        d = (T3 - T6)[:, :3, 3]
+        R6, R3 = T6[:, :3, :3], T3[:, :3, :3]
+        C = R6 @ C6[:, :3, :3] @ np.swapaxes(R6, 1, 2) + R3 @ C3[:, :3, :3] @ np.swapaxes(R3, 1, 2)
+        z = np.einsum("ni,nij,nj->n", d, np.linalg.inv(C), d)
+        squares.append(float(np.mean(z)) / 3.0)
+        inside += (z < stats.chi2.isf(0.05, 3)).tolist()
+    table(f"3D and 6D of the same robot, {seeds} seeds", ["measured", "mean mm", "worst mm"],
+          [[name, float(np.mean(e)), float(np.max(e))] for name, e in errors.items()])
+    print(f"  3D against 6D at 100 kept-out poses: squared normalised difference {np.mean(squares):.2f} per degree of "
+          f"freedom, {100 * np.mean(inside):.1f} % inside the joint 95 % region")
+
+
 def main() -> None:
     """Print the chosen tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -154,6 +202,8 @@ def main() -> None:
         convergence(1000 // share)
     if options.what in ("coverage", "all"):
         coverage(2000 // share)
+    if options.what in ("agreement", "all"):
+        agreement(max(2, 20 // share))
     if options.what in ("peers", "all"):
         from benchmarks.peers import compare
 

@@ -29,6 +29,7 @@ class Calibrated:
     q, tools : joint angles (n, N) and modelled tool frames (n, 4, 4) of the recorded poses.
     defaults : covariates at the first recorded pose, for poses to predict that do not state them.
     diagnosed : whether the diagnosis extended the model.
+    joint_sigma : scatter of the joints (rad, m) that no parameter explains: repeatability and structure that is left.
     """
 
     model: RobotModel
@@ -40,6 +41,7 @@ class Calibrated:
     tools: Array = field(repr=False)
     defaults: Mapping[str, float] = field(default_factory=dict)
     diagnosed: bool = False
+    joint_sigma: float = 0.0
 
 
 def load_calibrated(run: Run) -> Calibrated:
@@ -96,11 +98,20 @@ def inputs_to_predict(calibrated: Calibrated, kernel: Kernel, poses: Poses) -> P
 
 
 def predicted(calibrated: Calibrated, poses: Poses, *, nominal: bool = False) -> tuple[Array, Array | None]:
-    """Tool frames (n, 4, 4) in the world and their covariance (n, 6, 6); None for the nominal robot."""
+    """Tool frames (n, 4, 4) in the world and their covariance (n, 6, 6); None for the nominal robot.
+
+    The covariance says how far the tool may be from where it is told: uncertainty of the parameters, and what moves
+    the joints without being in the model. Weakness: all that is left counts as scatter of the joints, alike and
+    independent from pose to pose.
+    """
     kernel = Kernel(calibrated.nominal if nominal else calibrated.model, calibrated.statics)
     inputs = inputs_to_predict(calibrated, kernel, poses)
     if nominal:
         return kernel.frames(kernel.theta0, inputs), None
-    columns = [kernel.index[name] for name in calibrated.names]
+    columns = np.array([kernel.index[name] for name in calibrated.names], dtype=np.intp)
     T, J = kernel.frames_and_jacobian(kernel.theta0, inputs, columns)
-    return T, J @ calibrated.covariance @ np.swapaxes(J, 1, 2)
+    covariance = J @ calibrated.covariance @ np.swapaxes(J, 1, 2)
+    if calibrated.joint_sigma > 0.0:
+        moved = calibrated.joint_sigma * kernel.joint_jacobian(kernel.theta0, inputs)
+        covariance = covariance + moved @ np.swapaxes(moved, 1, 2)
+    return T, covariance

@@ -114,16 +114,16 @@ def work(context: Context) -> Outcome:
         write_table(run.next_poses, _columns(table))
         outputs.append(run.next_poses)
     calibrated: Calibrated = run.load("calibrated_identify")
+    calibrated = dataclasses.replace(calibrated, joint_sigma=diagnosis.joint_sigma)
     final = _final(diagnosis, recording)
     shared = None if orientation is None else final.common
     if diagnosis.findings or shared is not None:
         # a robot that was fitted beside the errors of its station is better even where nothing is missing
-        at = [final.free.index(name) for name in diagnosis.free]
         calibrated = dataclasses.replace(
             calibrated,
             model=with_folded_cell(diagnosis.model),
             names=diagnosis.free,
-            covariance=final.covariance[np.ix_(at, at)] * final.variance_factor,
+            covariance=diagnosis.covariance,
             statics="converged",  # as the diagnosis fits
             diagnosed=True,
         )

@@ -37,6 +37,8 @@ from robcal.robot.model import parameter_unit
 
 NAME = "verify"
 FOLDS = 5
+WEAK = 10.0
+"""A kept-out frame whose measurement is this many times less certain than usual says nothing about the robot."""
 
 
 def work(context: Context) -> Outcome:
@@ -53,6 +55,8 @@ def work(context: Context) -> Outcome:
     inputs = recorded_inputs(final.kernel, poses)
     kept_out = np.array([i for i in recording.poses if poses.verify[i]], dtype=np.int64)
     notes = ["measured positions are verified without what the diagnosis found in the measuring system"] * taken_back
+    kept_out, said = well_measured(recording, kept_out, poses.names)
+    notes += said
     if len(kept_out):
         nominal = fit_nominal(robot, inputs.subset(rows), recording.select(rows))
         outcome = verify(final, inputs.subset(kept_out), recording.select(kept_out), nominal)
@@ -72,6 +76,25 @@ def work(context: Context) -> Outcome:
     _write_residuals(run, poses, inputs, final, recording.observations)
     outputs = [run.save(NAME, (outcome, tested)), run.robot, run.covariance, run.residuals]
     return Outcome({"verification": _result(outcome)}, outputs, notes)
+
+
+def well_measured(recording: RobotRecording, kept_out: Rows, names: Sequence[str]) -> tuple[Rows, list[str]]:
+    """Kept-out poses without those of which one camera alone saw the plate, where most were measured much better."""
+    frames = [o for o in recording.observations if isinstance(o, FrameObservations)]
+    if len(frames) != 1 or len(recording.observations) != 1:
+        return kept_out, []
+    sigma = np.sqrt(np.trace(frames[0].covariance[:, :3, :3], axis1=1, axis2=2) / 3.0)
+    limit = WEAK * float(np.median(sigma))
+    weak = np.isin(kept_out, frames[0].pose[sigma > limit])
+    if not weak.any() or np.count_nonzero(weak) > len(kept_out) / 2:
+        return kept_out, []
+    listed = ", ".join(names[i] for i in kept_out[weak])
+    worst = 1e3 * float(sigma[np.isin(frames[0].pose, kept_out[weak])].max())
+    note = (
+        f"verified without {listed}: measured to {worst:.2g} mm only (usual: {1e3 * limit / WEAK:.2g} mm), which would "
+        "tell of the measurement, not of the robot"
+    )
+    return kept_out[~weak], [note]
 
 
 def with_model(found: IdentifiedRobot, calibrated: Calibrated) -> IdentifiedRobot:

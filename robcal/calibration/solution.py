@@ -26,8 +26,9 @@ CONCEIVABLE = 5.0
 """Deviations that robots may have, as a standard deviation in units of the plausible ones."""
 USUAL_STEP = 2.5
 """Steps of the iteration that are common, in units of the plausible deviations."""
-MISFIT_LEVEL = 1e-6
-"""p-value, of what all candidates together would take off the sum of squares, below which too much was eliminated."""
+MISFIT_LEVEL, MISFIT_SHARE = 1e-6, 0.25
+"""Too much was eliminated if all candidates together would take more than this share off the expected sum of squares,
+and that is no chance (p-value)."""
 
 
 @dataclass(frozen=True)
@@ -114,7 +115,7 @@ class Engine:
                 best = (worth, Solution(problem, state, tuple(kept), eliminated, {}, first, summary, iterations))
             gain = (2.0 * best[1].summary.cost - least) / self.scatter**2
             left_out = max(1.0, free - len(best[1].names))
-            strict = special.chdtrc(left_out, max(0.0, gain)) < MISFIT_LEVEL
+            strict = gain > MISFIT_SHARE * rows and special.chdtrc(left_out, gain) < MISFIT_LEVEL
             if round_ == 3 or (worse and not strict):
                 break
             if strict and round_ > 0:  # something that matters was left out as weak: look again with more patience

@@ -47,7 +47,12 @@ def as_contract(diagnosis: Diagnosis) -> dict[str, object]:
             "estimated": number(diagnosis.noise_estimated),
             "joint_repeatability_deg": number(math.degrees(diagnosis.joint_sigma)),
         },
-        "unexplained": {"p_value": number(diagnosis.unexplained_p), "pattern": diagnosis.unexplained_pattern},
+        "unexplained": {
+            "p_value": number(diagnosis.unexplained_p),
+            "pattern": diagnosis.unexplained_pattern,
+            # beyond the measuring noise: repeatability of the joints, and whatever no term of the model follows
+            "rms_mm": number(1e3 * math.sqrt(max(diagnosis.heldout[1] ** 2 - diagnosis.heldout[2] ** 2, 0.0))),
+        },
         "blunders": list(diagnosis.blunders),
         "next_poses": poses_table(diagnosis.next_poses, diagnosis.model),
         "notes": list(diagnosis.notes),

@@ -102,7 +102,8 @@ def find_curves(present: Fit, recording: Recording) -> Curves:
     for count in BUMPS_A_TURN:
         families = [periodic_curve(j, site.variables[f"q{j.number}"], count) for j in joints]
         columns = [at.columns(f, f.grid[0]) * f.sizes(f.grid[0]) for f in families]
-        if ROWS_A_BUMP * sum(c.shape[1] for c in columns) > len(present.residual):
+        visited = sum(_visited(site.variables[f"q{j.number}"], count) for j in joints)
+        if ROWS_A_BUMP * visited > len(present.residual):
             break
         folded = _folded(present, columns, label)
         after = folded.kept_out(range(len(columns)))
@@ -134,7 +135,7 @@ def find_curves(present: Fit, recording: Recording) -> Curves:
     square = float(r @ r)
     shares = tuple(float(np.clip((c @ v) @ r / square, 0.0, 1.0)) for c, v in zip(chosen, values, strict=True))
     left = r - np.sum([c @ v for c, v in zip(chosen, values, strict=True)], axis=0)
-    count = sum(c.shape[1] for c in chosen)
+    count = sum(_visited(site.variables[f"q{joints[k].number}"], chosen[0].shape[1]) for k in keep)
     log_p = log_f_probability(
         np.array([square - left @ left]), np.array([count]), np.array([square]), len(r) - present.jacobian.shape[1]
     )
@@ -144,6 +145,11 @@ def find_curves(present: Fit, recording: Recording) -> Curves:
     )
     alike = likenesses(accepted, [site.variables[f"q{joints[k].number}"] for k in keep])
     return Curves(accepted, shares, alike, float(min(1.0, len(BUMPS_A_TURN) * np.exp(log_p[0]))))
+
+
+def _visited(angles: Array, bumps: int) -> int:
+    """Number of bumps of a turn near which a joint was."""
+    return len(np.unique(np.round(angles / (2.0 * np.pi) * bumps).astype(int) % bumps))
 
 
 def frozen_terms(item: Accepted) -> tuple[Term, ...]:

@@ -132,6 +132,7 @@ def diagnose(
         heldout_kind="verify" if verify is not None else "cross-validation",
         model=final.model,
         free=final.free,
+        covariance=final.covariance[: len(final.free), : len(final.free)] * final.variance_factor,
         next_poses=poses,
         seconds=time.perf_counter() - start,
         region=region_errors(whole, fit(model, whole, free), final) if curves.accepted

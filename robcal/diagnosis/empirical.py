@@ -148,20 +148,20 @@ def _bump(site: RobotSite, joint: Joint) -> Family:
 
 
 def periodic_curve(joint: Joint, angles: Array, bumps: int) -> Family:
-    """An irregular error of a joint that repeats every turn: bumps on the circle where the joint was (angles in rad).
+    """An irregular error of a joint that repeats every turn: bumps all round the circle; angles (n,) as recorded, rad.
 
-    The bumps are von Mises' (exp(cos)), so a joint at -90 deg and at 270 deg has the same error.
+    The bumps are von Mises' (exp(cos)), so a joint at -90 deg and at 270 deg has the same error. Where the joint never
+    was their amplitudes stay zero with the uncertainty of their prior, which predictions there need.
     """
     k = joint.number
     spacing = 2.0 * np.pi / bumps
-    near = np.unique(np.round((angles % (2.0 * np.pi)) / spacing).astype(int) % bumps)
-    centres = [float(np.round(i * spacing, 9)) for i in near]
+    centres = [float(np.round(i * spacing, 9)) for i in range(bumps)]
     sharp = float(np.round(1.0 / (0.9 * spacing) ** 2, 6))
 
     def bases(c: Constants) -> tuple[Basis, ...]:
         return tuple(
             Basis(joint.frame, "q", f"exp(sharp*(cos(q{k} - centre) - 1))", f"c{i}", {"sharp": sharp, "centre": x})
-            for i, x in zip(near, centres, strict=True)
+            for i, x in enumerate(centres)
         )
 
     return Family(

@@ -71,7 +71,8 @@ class Diagnosis:
     heldout : (before, after, noise floor) in metres; `heldout_kind` 'verify' or 'cross-validation'.
     region : (before, after) in metres, at one end of the measured space predicted from all other poses that were used
         to identify; None for short recordings.
-    model : robot with everything accepted.
+    model, free : robot with everything accepted, and its fitted parameters.
+    covariance : (p, p) of these, m and rad; the joints' scatter, which no parameter explains, comes on top of it.
     """
 
     p_value: float
@@ -85,6 +86,7 @@ class Diagnosis:
     heldout_kind: str
     model: RobotModel
     free: tuple[str, ...]
+    covariance: Array
     next_poses: tuple[Mapping[str, float], ...] = ()
     seconds: float = 0.0
     notes: tuple[str, ...] = field(default=())

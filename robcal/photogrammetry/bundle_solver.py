@@ -22,8 +22,9 @@ from robcal.photogrammetry.bundle_normals import (
     linearise_lengths,
     whitened_residuals,
 )
+from robcal.photogrammetry.camera import project
 from robcal.photogrammetry.datum import Datum
-from robcal.photogrammetry.eccentricity import body_normals, centre_shift
+from robcal.photogrammetry.eccentricity import body_normals, centre_shift, rim_offset
 from robcal.photogrammetry.network import IntArray
 from robcal.transforms import Array
 
@@ -95,9 +96,15 @@ class Problem:
         if not np.any(self.radii > 0):
             return np.zeros((len(marks), 2))
         R, t = state.camera_T_body[marks.image, :3, :3], state.camera_T_body[marks.image, :3, 3]
+        normals = self.target_normals(state.points)
+        offset = rim_offset(state.points, self.radii, normals)
         p = np.einsum("mij,mj->mi", R, state.points[marks.target]) + t
-        n = np.einsum("mij,mj->mi", R, self.target_normals(state.points)[marks.target])
-        return centre_shift(state.camera, p, n, self.radii[marks.target])
+        n = np.einsum("mij,mj->mi", R, normals[marks.target])
+        if not offset.any():
+            return centre_shift(state.camera, p, n, self.radii[marks.target])
+        rim = p + np.einsum("mij,mj->mi", R, offset[marks.target])
+        sunk = project(state.camera, rim) - project(state.camera, p)
+        return sunk + centre_shift(state.camera, rim, n, self.radii[marks.target])
 
     def linearised_bars(self, points: Array) -> LinearisedLengths:
         """Scale bars at these points."""

@@ -116,9 +116,12 @@ def adjust_with_colmap(
     c = network.camera
     f = 0.5 * (c.fx + c.fy)
     start = Camera(c.width, c.height, f, f, (c.width - 1) / 2, (c.height - 1) / 2)
-    model = to_reconstruction(
-        start, network.camera_T_body, network.points, network.marks, network.image_names, with_k3=False
-    )
+    problem, state = problem_of(network, lengths)
+    # COLMAP knows points only: it gets the images of the centres, where the ellipses of large dots lie elsewhere
+    shift = np.empty((len(network.marks), 2))
+    shift[problem.order.order] = problem.shift(state)
+    marks = replace(network.marks, xy=network.marks.xy - shift)
+    model = to_reconstruction(start, network.camera_T_body, network.points, marks, network.image_names, with_k3=False)
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_principal_point = True
     options.print_summary = False
@@ -144,17 +147,15 @@ def adjust_with_colmap(
         scale = float(np.sum(w * measured * lengths.length) / np.sum(w * measured**2))
         frame = fit_similarity(network.points, scale * points, with_scale=False)
         frame = replace(frame, scale=scale)
-    problem, state = problem_of(network, lengths)
     free = tuple(name for name in network.free_intrinsics if name != "k3")
     problem = replace(
         problem,
         basis=intrinsics_basis(free),
         bars=Bars(rows, lengths.length, lengths.sigma),
         datum=Datum("inner", np.arange(t), len(lengths) == 0, network.datum),
-        radii=np.zeros(t),
     )
     state = replace(state, camera=camera, camera_T_body=frame.stations(poses), points=frame.points(points))
-    note = "engine pycolmap: marks weighted alike, k3 = 0, no eccentricity, scale bars used for the scale only"
+    note = "engine pycolmap: marks weighted alike, k3 = 0, scale bars used for the scale only"
     return finish(
         problem,
         state,

@@ -1,25 +1,33 @@
 """Where the measured centre of a circular target lies: not in the image of the circle's centre.
 
-Two effects, both exact to second order of the dot's image size:
+Two effects, both exact to second order of the dot's image size, and a third on curved bodies:
 
 - perspective: the centre of the projected ellipse is the pole of the line at infinity with respect to the dual conic
   (Hartley and Zisserman, Multiple View Geometry, 2nd ed., 8.3), see :mod:`robcal.photogrammetry.eccentric_circle`;
 - distortion changes across the dot: the area centroid of an ellipse with second moments ``S`` under a smooth map ``g``
   with Jacobian ``G`` and second derivatives ``H`` is ``g + H:S/2 + G S grad(ln det G)``. A least-squares ellipse
-  through the contour has the same centre to this order.
+  through the contour has the same centre to this order;
+- a dot on a sphere ends in a plane below its centre (16 um at 5 mm on a radius of 200 mm): it is that circle which is
+  seen, see :func:`rim_offset`.
 """
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from robcal.photogrammetry.camera import Camera, project, project_with_jacobians
 from robcal.photogrammetry.eccentric_circle import effective_point
 from robcal.transforms import Array
 
+IntArray = NDArray[np.int64]
+
 _STEP = 1e-4
 """Half the interval of the central differences over ideal image coordinates (radians, so about 0.2 px)."""
+
+_RADIAL = np.cos(np.radians(8.0))
 
 
 def centre_shift(camera: Camera, p_camera: ArrayLike, normal_camera: ArrayLike, radius: ArrayLike) -> Array:
@@ -115,12 +123,36 @@ def body_normals(points: ArrayLike, neighbours: int = 6) -> Array:
     return normals
 
 
+def rim_offset(points: ArrayLike, radii: ArrayLike, normals: ArrayLike | None = None) -> Array:
+    """From the centre of each dot to the centre of its rim (t, 3): not zero where most targets lie on a sphere.
+
+    ``radii`` (t,) m of the dots; ``normals`` (t, 3): targets that do not face away from the sphere's centre are not
+    pasted onto it, but sit on facets.
+    """
+    p, r = np.asarray(points, dtype=float), np.nan_to_num(np.asarray(radii, dtype=float))
+    offset = np.zeros_like(p)
+    if len(p) < 8 or not np.any(r > 0):
+        return offset
+    width = float(np.median(np.linalg.norm(p - np.median(p, axis=0), axis=1)))
+    shape = _dominant_shape(p, 0.02 * width)
+    if shape is None or shape[1] is not None:
+        return offset
+    away = p - shape[0]
+    distance = np.linalg.norm(away, axis=1)
+    radius = float(np.median(distance))
+    on = (np.abs(distance / radius - 1.0) < 0.02) & (r < 0.5 * radius)
+    radial = away / distance[:, None]
+    if normals is not None:
+        on &= np.abs(np.einsum("ti,ti->t", np.nan_to_num(np.asarray(normals, dtype=float)), radial)) > _RADIAL
+    depth = radius - np.sqrt(radius**2 - np.where(on, r, 0.0) ** 2)
+    return np.asarray(-depth[:, None] * radial)
+
+
 def _dominant_shape(points: Array, tolerance: float) -> tuple[Array, Array | None] | None:
     """(centre, normal) of a plane or (centre, None) of a sphere that holds 70 % of points (t, 3); None if neither."""
     t = len(points)
     needed = 0.7 * t
-    rng = np.random.default_rng(0)
-    triples = np.array([rng.choice(t, 3, replace=False) for _ in range(60)])
+    triples = _triples(t)
     a, b, c = (points[triples[:, k]] for k in range(3))
     normal = np.cross(b - a, c - a)
     length = np.linalg.norm(normal, axis=1)
@@ -143,6 +175,13 @@ def _dominant_shape(points: Array, tolerance: float) -> tuple[Array, Array | Non
         chosen = points[close]
     held = np.count_nonzero(miss < 0.02 * radius)
     return (centre, None) if held >= needed else None
+
+
+@lru_cache(maxsize=64)
+def _triples(count: int) -> IntArray:
+    """Sixty random triples of ``count`` points, always the same."""
+    rng = np.random.default_rng(0)
+    return np.array([rng.choice(count, 3, replace=False) for _ in range(60)])
 
 
 def fit_sphere(points: ArrayLike) -> tuple[Array, float, float]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from robcal import transforms as tf
 from robcal.calibration.identification import identify
 from robcal.calibration.observations import FrameObservations
 from robcal.diagnosis.curves import LEAST_POSES, curve, find_curves, likenesses, nested_errors
@@ -12,6 +13,7 @@ from robcal.diagnosis.diagnose import diagnose
 from robcal.diagnosis.empirical import periodic_curve
 from robcal.diagnosis.recording import Accepted, Fit, Recording, fit, terms_of
 from robcal.physics.site import Joint
+from robcal.robot.kernel import Kernel
 from tests.calibration.scenarios import Scenario, scenario
 
 ORDERS = np.arange(3, 25)
@@ -116,3 +118,31 @@ def test_diagnosis_models_the_curves(uneven: tuple[Recording, Fit, np.ndarray]) 
     assert told.heldout[1] < 0.4 * told.heldout[0]
     assert told.joint_sigma < 0.5 * np.std(added)
     assert "turned by" in " ".join(f.statement for f in curves)
+
+
+def test_predicted_covariance_holds_at_poses_kept_out(uneven: tuple[Recording, Fit, np.ndarray]) -> None:
+    """Joints that scatter and curves that are known only where the joints were: errors have the size that is told."""
+    s = scenario(3, n=400)
+
+    def wrong(q: np.ndarray) -> np.ndarray:
+        added = np.stack([pattern(k, q[:, k]) for k in range(6)], axis=1)
+        return np.asarray(q + added + 1e-4 * s.rng.normal(size=q.shape))
+
+    recording, obs = recorded(wrong(s.poses.q), s)
+    found = identify(s.model, s.poses, [obs], kernel=s.kernel)
+    told = diagnose(found.model, recording, found.names)
+    assert told.joint_sigma == pytest.approx(1e-4, rel=0.4)
+    true = s.truth.frames(s.theta, s.kept_out.with_q(wrong(s.kept_out.q)))
+    kernel = Kernel(told.model, "converged")
+    inputs = kernel.poses(s.kept_out.q, "dumbbell", {"index": np.arange(len(s.kept_out), dtype=float)})
+    T, J = kernel.frames_and_jacobian(kernel.theta0, inputs, np.array([kernel.index[n] for n in told.free]))
+    moved = told.joint_sigma * kernel.joint_jacobian(kernel.theta0, inputs)
+    error = (tf.invert(T) @ true)[:, :3, 3]
+    parameters = (J @ told.covariance @ J.swapaxes(1, 2))[:, :3, :3]
+    whole = parameters + (moved @ moved.swapaxes(1, 2))[:, :3, :3]
+
+    def normalised(V: np.ndarray) -> float:
+        return float(np.sqrt(np.mean(np.einsum("ni,nij,nj->n", error, np.linalg.inv(V), error)) / 3.0))
+
+    assert 0.8 < normalised(whole) < 1.3
+    assert normalised(parameters) > 1.5

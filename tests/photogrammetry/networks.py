@@ -138,7 +138,9 @@ def make_network(
         seen &= np.einsum("mi,mi->m", n, p) / np.linalg.norm(p, axis=1) < -0.3
     image, target, xy, p, n = image[seen], target[seen], xy[seen], p[seen], n[seen]
     if diameter:
-        xy = np.array([polygon_centre(camera, a, b, diameter / 2) for a, b in zip(p, n, strict=True)])
+        # a dot on a sphere ends in a plane below its centre
+        depth = 0.2 - np.sqrt(0.2**2 - diameter**2 / 4) if body == "sphere" else 0.0
+        xy = np.array([polygon_centre(camera, a - depth * b, b, diameter / 2) for a, b in zip(p, n, strict=True)])
     covariance = np.tile(np.eye(2) * sigma**2, (len(image), 1, 1))
     marks = ImageMarks(image, target, xy + rng.normal(0.0, sigma, xy.shape), covariance)
     return Truth(camera, T, points, normals, diameter, marks, sigma)

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from robcal.photogrammetry.camera import Camera, project
-from robcal.photogrammetry.eccentricity import body_normals, centre_shift, fit_sphere
+from robcal.photogrammetry.eccentricity import body_normals, centre_shift, fit_sphere, rim_offset
 from tests.photogrammetry.networks import plate_points, polygon_centre, sphere_points
 
 
@@ -83,3 +83,21 @@ def test_sphere_fit() -> None:
     np.testing.assert_allclose(centre, [0.1, 0.2, -5.0], atol=1e-9)
     assert radius == pytest.approx(0.3)
     assert misfit < 1e-9
+
+
+def test_a_dot_on_a_sphere_ends_below_its_centre() -> None:
+    p = sphere_points(np.random.default_rng(5), 40) + np.array([1.0, 2.0, 3.0])
+    radii = np.full(40, 0.0025)
+    radii[7] = 0.0
+    normals = body_normals(p)
+    offset = rim_offset(p, radii, normals)
+    depth = 0.2 - np.sqrt(0.2**2 - 0.0025**2)
+    others = np.arange(40) != 7
+    np.testing.assert_allclose(offset[others], -depth * normals[others], rtol=1e-6, atol=1e-12)
+    assert not offset[7].any()
+    # on facets, and on a plate, it does not
+    tilted = normals + 0.3 * np.random.default_rng(6).normal(size=normals.shape)
+    tilted /= np.linalg.norm(tilted, axis=1)[:, None]
+    facets = np.abs(np.einsum("ti,ti->t", tilted, normals)) < 0.98
+    assert not rim_offset(p, radii, tilted)[facets].any()
+    assert not rim_offset(plate_points(np.random.default_rng(7), 40), radii).any()

@@ -170,8 +170,9 @@ def test_fixed_datum_and_bars_datum() -> None:
     assert any("one line" in note for note in one.notes)
 
 
-def test_both_engines_agree() -> None:
-    truth, rng = plate(25, coded=24, targets=24, distortion=(-0.1, 0.05, 2e-4, -1e-4, 0.0))
+@pytest.mark.parametrize("diameter", [0.0, 0.04])
+def test_both_engines_agree(diameter: float) -> None:
+    truth, rng = plate(25, coded=24, targets=24, distortion=(-0.1, 0.05, 2e-4, -1e-4, 0.0), diameter=diameter)
     images, targets = detections(truth, 24, rng), listed(truth, 24)
     settings = SurveySettings(
         free_intrinsics=("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"), adjust=AdjustSettings(tolerance=1e-12)

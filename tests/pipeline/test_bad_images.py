@@ -6,7 +6,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from pipeline.cli import app
 from pipeline.images import read_image
 from pipeline.runner import run_campaign
 from robcal.errors import RobcalError
@@ -14,11 +16,12 @@ from tests.pipeline.conftest import edit_rows, edit_yaml
 
 
 def refused(campaign: Path, out: Path, until: str = "orient") -> str:
-    with pytest.raises(RobcalError) as error:
-        run_campaign(campaign, out, until=until, workers=1)
-    text = str(error.value)
-    assert "\n" not in text
+    """The sentence with which the command refuses a campaign."""
+    done = CliRunner().invoke(app, ["run", str(campaign), "--out", str(out), "--until", until, "--workers", "1", "-q"])
+    assert done.exit_code == 1
+    (text,) = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
     assert "internal error" not in text
+    assert "Traceback" not in done.output
     return text
 
 

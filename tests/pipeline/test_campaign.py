@@ -5,18 +5,24 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from pipeline.campaign import read_campaign
+from pipeline.cli import app
 from pipeline.runner import run_campaign
 from robcal.errors import InvalidInput
 from tests.pipeline.conftest import Rows, edit_rows, edit_yaml
 
 
 def refused(path: Path) -> str:
-    with pytest.raises(InvalidInput) as error:
-        read_campaign(path)
-    text = str(error.value)
-    assert "\n" not in text
+    """The sentence with which the command refuses a campaign before any stage runs."""
+    out = path.parent / "refused"
+    done = CliRunner().invoke(app, ["run", str(path), "--out", str(out), "-q"])
+    assert done.exit_code == 1
+    assert "Traceback" not in done.output
+    assert not out.exists()
+    (text,) = done.stderr.splitlines()
+    assert text.startswith("error: ")
     return text
 
 

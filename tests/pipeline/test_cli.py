@@ -6,7 +6,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
+import pycolmap
 import pytest
+import yaml
 from typer.testing import CliRunner
 
 from pipeline.cli import app
@@ -126,7 +129,14 @@ def test_survey_alone_and_unknown_body(image_campaign: Path, detected: Path) -> 
     answer = json.loads(done.stdout)
     assert answer["ran"] == ["detect", "survey"]
     assert answer["survey"]["plate"]["images"] >= 6
-    assert (detected / "bodies" / "plate.yaml").is_file()
+    body = yaml.safe_load((detected / "bodies" / "plate.yaml").read_text(encoding="utf-8"))
+    assert all(np.linalg.norm(t["normal"]) == pytest.approx(1.0, abs=1e-5) for t in body["targets"])
+    # the targets of the scale bars are listed, but not on the plate
+    assert {t["id"] for t in body["targets"]}.isdisjoint({51, 53, 55, 57})
+    model = pycolmap.Reconstruction(detected / "colmap" / "plate")
+    assert model.num_images() == answer["survey"]["plate"]["images"]
+    assert model.num_points3D() == answer["survey"]["plate"]["targets"]
+    assert model.compute_mean_reprojection_error() < 1.0
 
 
 def test_as_a_process_nothing_but_the_sentence_is_printed(point_campaign: Path, tmp_path: Path) -> None:

@@ -1,0 +1,32 @@
+"""Which kept-out poses the verification counts."""
+
+import numpy as np
+
+from pipeline.stages.observations import RobotRecording
+from pipeline.stages.verify import well_measured
+from robcal.calibration.observations import FrameObservations
+
+NAMES = [f"p{i}" for i in range(20)]
+
+
+def recording(sigma_mm: list[float]) -> RobotRecording:
+    sigma = np.array(sigma_mm) / 1e3
+    covariance = (sigma**2)[:, None, None] * np.eye(6)
+    frames = FrameObservations(np.arange(len(sigma)), np.tile(np.eye(4), (len(sigma), 1, 1)), covariance)
+    return RobotRecording((frames,), (frames,), True)
+
+
+def test_a_pose_seen_by_one_camera_only_is_left_out_and_named() -> None:
+    kept, notes = well_measured(recording([0.05] * 19 + [3.0]), np.array([16, 17, 18, 19]), NAMES)
+    np.testing.assert_array_equal(kept, [16, 17, 18])
+    assert len(notes) == 1
+    assert "p19" in notes[0]
+    assert "3 mm only (usual: 0.05 mm)" in notes[0]
+
+
+def test_evenly_measured_poses_all_count() -> None:
+    rows = np.array([16, 17, 18, 19])
+    for sigma in ([0.05] * 20, [0.05] * 16 + [0.3] * 4, [0.05] * 16 + [0.05, 3.0, 3.0, 3.0]):
+        kept, notes = well_measured(recording(sigma), rows, NAMES)
+        np.testing.assert_array_equal(kept, rows)
+        assert notes == []
