@@ -184,7 +184,8 @@ def report(records: Sequence[Record]) -> str:
         if done:
             seconds = [r["seconds"] for r in done]
             parts.append(TABLES[battery](done))
-            parts.append(f"\nTime: median {np.median(seconds):.1f} s, longest {max(seconds):.1f} s.")
+            parts.append(f"\nReading, identification, diagnosis: median {np.median(seconds):.1f} s, ")
+            parts[-1] += f"longest {max(seconds):.1f} s."
         if failed:
             parts.append(f"\n{len(failed)} runs failed; the first: {failed[0]['key']}: {failed[0]['error']}")
         parts.append("")

@@ -7,22 +7,23 @@ Parameter Estimation, section 3.6), which allows for the parameters taken from t
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize, stats
 
-from robcal import transforms as tf
 from robcal.calibration.identification import IdentifiedRobot
 from robcal.calibration.observations import Observations, Stack
-from robcal.calibration.problem import Evaluator, State, joint_scatter
+from robcal.calibration.problem import Evaluator, State, whitening
 from robcal.robot.kernel import PoseInputs
 
 Array = NDArray[np.float64]
 
-SMALLEST_JOINT_SIGMA, LARGEST_JOINT_SIGMA = 1e-7, 1e-2
+NO_SCATTER = -700.0
+BELOW, ABOVE, LOOKS = 8.0, 10.0, 8
+"""Range of the logarithm of the ratio around equal shares, and looks in it before the minimum is refined."""
 
 
 @dataclass(frozen=True)
@@ -59,41 +60,78 @@ def estimate_noise(
     inside = poses.subset(rows)
     stack = Stack([o.subset(rows) for o in observations], len(rows))
     state = State(robot.full_theta, robot.kernel.world_T_base, robot.kernel.flange_T_tool)
-    at = Evaluator(robot.kernel, inside, stack)(state)
-    C = stack.covariance(at.T)
-    G = tf.transport_covariance(at.B, joint_scatter(robot.kernel, state, inside, 1.0))
-    X = at.B @ at.J[:, :, robot.columns]
-    m, p = stack.rows, len(robot.names)
-    if m <= p:
+    evaluator = Evaluator(robot.kernel, inside, stack)
+    at = evaluator(state)
+    white = whitening(evaluator, state)
+    kernel = robot.kernel.with_references(state.world_T_base, state.flange_T_tool)
+    moved = white @ at.B @ kernel.joint_jacobian(state.theta, inside)
+    r = np.einsum("nij,nj->ni", white, at.r)
+    X = white @ at.B @ at.J[:, :, robot.columns]
+    used = stack.used
+    if stack.rows <= len(robot.names):
         return NoiseEstimate(1.0, 0.0, 1.0, 1.0)
+    found = restricted_components([(moved[i][u], r[i][u], X[i][u]) for i, u in enumerate(used)])
+    if found.p_value > level:
+        return NoiseEstimate(float(np.sqrt(found.alone)), 0.0, found.p_value, float(np.sqrt(found.alone)))
+    joint = float(np.sqrt(found.variance * found.ratio))
+    return NoiseEstimate(float(np.sqrt(found.variance)), joint, found.p_value, float(np.sqrt(found.alone)))
 
-    def profile(ratio: float) -> tuple[float, float]:
-        """Minus twice the restricted log-likelihood (up to a constant) and f^2 for a ratio lambda."""
-        L = np.linalg.cholesky(C + ratio * G)
-        white = np.linalg.solve(L, np.concatenate([at.r[..., None], X], axis=2))
-        r, A = white[..., 0].ravel(), white[..., 1:].reshape(-1, p)
-        scale = np.linalg.norm(A, axis=0)
-        scale[scale == 0] = 1.0
-        Q, R = np.linalg.qr(A / scale)
-        left = r - Q @ (Q.T @ r)
-        f2 = float(left @ left) / (m - p)
-        log_det = 2.0 * float(np.sum(np.log(np.diagonal(L, axis1=1, axis2=2))))
-        log_det += 2.0 * float(np.sum(np.log(np.abs(np.diag(R)))) + np.sum(np.log(scale)))
-        return (m - p) * np.log(max(f2, 1e-300)) + log_det, f2
 
-    none, f2_none = profile(0.0)
-    f_none = np.sqrt(f2_none)
-    low, high = (2 * np.log(s / max(f_none, 1e-12)) for s in (SMALLEST_JOINT_SIGMA, LARGEST_JOINT_SIGMA))
-    grid = np.linspace(low, high, 12)
-    values = [profile(float(np.exp(g)))[0] for g in grid]
-    k = int(np.argmin(values))
-    bounds = (grid[max(0, k - 1)], grid[min(len(grid) - 1, k + 1)])
-    best = optimize.minimize_scalar(lambda g: profile(float(np.exp(g)))[0], bounds=bounds, method="bounded",
-                                    options={"xatol": 1e-3})
-    ratio = float(np.exp(best.x))
-    likelihood, f2 = profile(ratio)
-    # at the edge of the parameter space the statistic is half a chi-square with one degree of freedom
-    p_value = 0.5 * float(stats.chi2.sf(max(0.0, none - likelihood), 1))
-    if p_value > level:
-        return NoiseEstimate(float(f_none), 0.0, p_value, float(f_none))
-    return NoiseEstimate(float(np.sqrt(f2)), float(np.sqrt(f2 * ratio)), p_value, float(f_none))
+@dataclass(frozen=True)
+class Components:
+    """Variance components of whitened rows.
+
+    Attributes
+    ----------
+    variance : factor on the stated covariance. ratio : variance of the joints (rad^2 or m^2) in units of it.
+    alone : the factor if there were no joint scatter. statistic : twice the logarithm of the likelihood ratio.
+    """
+
+    variance: float
+    ratio: float
+    alone: float
+    statistic: float
+
+    @property
+    def p_value(self) -> float:
+        """Of the test against none; at the edge of the parameter space it is half a chi-square with one degree."""
+        return 0.5 * float(stats.chi2.sf(max(0.0, self.statistic), 1))
+
+
+def restricted_components(blocks: Iterable[tuple[Array, Array, Array]]) -> Components:
+    """Maximise the restricted likelihood over the ratio of the components; the common factor follows in closed form.
+
+    Parameters
+    ----------
+    blocks : of each pose, whitened by the stated covariance: displacement (k, N) by unit of each joint, residual (k,),
+        and Jacobian (k, p) of what was fitted (and of whatever else is to be projected out).
+    """
+    parts = []
+    for A, r, X in blocks:
+        values, vectors = np.linalg.eigh(A @ A.T)
+        parts.append((np.clip(values, 0.0, None), vectors.T @ r, vectors.T @ X))
+    values, r, J = (np.concatenate([part[k] for part in parts]) for k in range(3))
+    size = np.linalg.norm(J, axis=0)
+    U, s, _ = np.linalg.svd(J[:, size > 0] / size[size > 0], full_matrices=False)
+    J = U[:, s > 1e-9 * s.max(initial=0.0)]
+    freedom = len(r) - J.shape[1]
+
+    def profile(log_ratio: float) -> tuple[float, float]:
+        """Minus twice the log-likelihood, up to a constant, and the factor."""
+        weight = 1.0 / (1.0 + np.exp(log_ratio) * values)
+        normal = J.T @ (weight[:, None] * J)
+        left = r - J @ np.linalg.solve(normal, J.T @ (weight * r))
+        variance = max(float(np.sum(weight * left**2)) / freedom, 1e-300)
+        log_det = float(np.linalg.slogdet(normal)[1])
+        return freedom * np.log(variance) - float(np.sum(np.log(weight))) + log_det, variance
+
+    none = profile(NO_SCATTER)
+    middle = -np.log(max(float(np.mean(values)), 1e-300))
+    # the likelihood may have a second hill: a coarse look first
+    grid = np.linspace(middle - BELOW, middle + ABOVE, LOOKS)
+    k = int(np.argmin([profile(float(x))[0] for x in grid]))
+    found = optimize.minimize_scalar(
+        lambda x: profile(x)[0], bounds=(grid[max(0, k - 1)], grid[min(LOOKS - 1, k + 1)]), method="bounded",
+        options={"xatol": 1e-2},
+    )  # fmt: skip
+    return Components(profile(float(found.x))[1], float(np.exp(found.x)), none[1], none[0] - float(found.fun))

@@ -29,6 +29,7 @@ def image_causes(data: ImageData, moves: bool = True) -> Iterator[ImageCause]:
             yield from _lens(data, c, name, rows)
             yield from refraction_causes(data, c, name, rows)
             yield from _eccentricity(data, c, name, rows)
+            yield from _bias(data, name, rows)
             yield _field(data, c, name, rows)
             if moves and data.by_exterior is not None:
                 yield from _moves(data, name, rows)
@@ -94,6 +95,29 @@ def _eccentricity(data: ImageData, c: int, name: str, rows: Array) -> Iterator[I
         "Dots seen obliquely by {where} show off their centres as dots of {diameter_mm:.1f} mm do",
         bends=True,
         plausible=lambda v: float(v[0]) > 0,
+    )
+
+
+def _bias(data: ImageData, name: str, rows: Array) -> Iterator[ImageCause]:
+    """Centres displaced along the direction in which a dot is tilted: lit unevenly, or glossy on one side.
+
+    Weakness: a displacement that is the same for all dots, or goes with their size alone, is taken over by the
+    principal point and the camera's place and cannot be seen.
+    """
+    tilt = data.normal_camera[:, :2]
+    if not data.dots or not np.any(np.isfinite(tilt[rows])):
+        return
+    yield ImageCause(
+        "centroid_bias",
+        "image",
+        name,
+        None,
+        only(rows, np.nan_to_num(tilt)[:, :, None]),
+        np.array([0.1]),
+        lambda v: {"px": float(v[0])},
+        "Centres of tilted dots in {where} are displaced along their tilt, by {px:.3f} px at a right angle",
+        weight=0.3,
+        bends=True,
     )
 
 

@@ -1,11 +1,14 @@
 """Every cause that shows in images is found, named and sized; where nothing is missing nothing is said."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from robcal.diagnosis.image_data import survey_data
 from robcal.diagnosis.image_diagnosis import diagnose_images, spread_of_others
 from robcal.diagnosis.image_exchange import exchanged_targets
+from robcal.photogrammetry.eccentricity import centre_shift
 from tests.diagnosis.image_scenes import station, survey, told
 
 
@@ -107,3 +110,34 @@ def test_spread_of_targets_is_not_spoilt_by_the_displaced_one() -> None:
     spoilt = spread_of_others(bases, residual + bases[2] @ np.array([40.0, -30.0, 20.0]))
     assert clean < 3.0
     assert spoilt < 3.0
+
+
+def _dots(seed: int, **plan: int):
+    """A healthy station whose targets are round dots of unknown size, facing along the body's z."""
+    data = station(seed=seed, targets=20, views=30, **plan).data
+    return replace(data, dots=True, normal_camera=data.camera_R_body[:, :, 2], radii=np.zeros(len(data.xy)))
+
+
+def _displaced(data, shift):
+    return replace(data, residual=data.residual + data.remove(data.whiten(shift[:, :, None]))[:, 0])
+
+
+def test_dots_of_unstated_size_that_show_off_their_centres():
+    data = _dots(11)
+    rows = data.camera == 1
+    shift = centre_shift(data.cameras[1], data.p_camera, data.normal_camera, np.where(rows, 0.02, 0.0))
+    (found,) = diagnose_images(_displaced(data, shift)).findings
+    assert (found.cause, found.stage, found.where) == ("ellipse_eccentricity", "image", data.names[1])
+    assert abs(found.parameters["diameter_mm"] - 40.0) < 4.0 * found.sigma["diameter_mm"]
+
+
+def test_centres_displaced_along_the_tilt_of_dots():
+    data = _dots(12)
+    rows = data.camera == 0
+    (found,) = diagnose_images(_displaced(data, 0.3 * rows[:, None] * data.normal_camera[:, :2])).findings
+    assert (found.cause, found.stage, found.where) == ("centroid_bias", "image", data.names[0])
+    assert abs(found.parameters["px"] - 0.3) < 4.0 * found.sigma["px"]
+
+
+def test_dots_of_a_healthy_station_have_no_bias():
+    assert not diagnose_images(_dots(13)).findings
