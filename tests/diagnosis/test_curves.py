@@ -110,6 +110,7 @@ def test_long_laws_become_several_terms_with_priors() -> None:
     assert [v for t in terms for v in t.parameters.values()] == pytest.approx(np.arange(count) * 1e-5)
 
 
+@pytest.mark.slow
 def test_diagnosis_models_the_curves(uneven: tuple[Recording, Fit, np.ndarray]) -> None:
     recording, present, added = uneven
     told = diagnose(present.model, recording, present.free)
@@ -131,6 +132,7 @@ def test_predicted_covariance_holds_at_poses_kept_out(uneven: tuple[Recording, F
     recording, obs = recorded(wrong(s.poses.q), s)
     found = identify(s.model, s.poses, [obs], kernel=s.kernel)
     told = diagnose(found.model, recording, found.names)
+    assert [f.family.where for f in told.findings][:6] == [f"axis{k}" for k in range(1, 7)]
     assert told.joint_sigma == pytest.approx(1e-4, rel=0.4)
     true = s.truth.frames(s.theta, s.kept_out.with_q(wrong(s.kept_out.q)))
     kernel = Kernel(told.model, "converged")
