@@ -35,6 +35,8 @@ from robcal.photogrammetry.measured_points import MeasuredPoints
 from robcal.photogrammetry.station_network import StationOrientation
 
 NAME = "diagnose"
+UNCORRECTED = frozenset({"refraction", "ellipse_eccentricity", "centroid_bias"})
+BEYOND_DOUBT = 1e-6
 
 
 def recording_for_diagnosis(
@@ -100,7 +102,7 @@ def work(context: Context) -> Outcome:
         free,
         tied,
         verify,
-        settings_of(campaign),
+        settings_beside(settings_of(campaign), images.findings),
         context.messages.info,
         cross_elasticities(found),
     )
@@ -158,6 +160,16 @@ def cross_elasticities(found: IdentifiedRobot) -> tuple[str, ...]:
         return ()
     own = {f"{joint.name}.elastic_{joint.joint_kind}" for joint in found.model.joints if not joint.prismatic}
     return tuple(name for name in found.names if ".elastic_" in name and name not in own)
+
+
+def settings_beside(settings: SelectionSettings, findings: Sequence[ImageFinding]) -> SelectionSettings:
+    """Settings beside causes in images that displace what is measured and are not taken back.
+
+    What they leave in the frames looks like small causes of the robot; only what is far beyond doubt is told.
+    """
+    if any(finding.cause in UNCORRECTED for finding in findings):
+        return dataclasses.replace(settings, level=min(settings.level, BEYOND_DOUBT))
+    return settings
 
 
 def settings_of(campaign: Campaign) -> SelectionSettings:

@@ -17,7 +17,10 @@ from pipeline.moved_cameras import epochs_of
 from pipeline.poses_table import read_poses
 from pipeline.runner import run_campaign
 from pipeline.runs import Run
+from pipeline.stages.diagnose import settings_beside
 from pipeline.stages.identify import load_identification
+from robcal.diagnosis.image_diagnosis import ImageFinding
+from robcal.diagnosis.selection import SelectionSettings
 
 PLAN = {"seed": 21, "robot": "ur10", "poses": 50, "verify": 10, "kept_out": 30}
 
@@ -78,3 +81,12 @@ def test_moved_base_may_be_moved_cameras(tmp_path: Path) -> None:
     assert {"cause": "camera_moved", "where": "station"}.items() <= first["indistinguishable_from"][-1].items()
     assert content["next_poses"]
     assert "targets at rest" in " ".join(content["notes"])
+
+
+def test_robot_is_judged_sternly_beside_uncorrected_causes_in_images() -> None:
+    def found(cause: str) -> ImageFinding:
+        return ImageFinding(cause, "camera", "left", None, {}, {}, 1e-9, (), (1.0, 0.5), "")
+
+    plain = SelectionSettings()
+    assert settings_beside(plain, [found("lens_radial"), found("camera_moved")]) == plain
+    assert settings_beside(plain, [found("refraction")]).level == 1e-6
