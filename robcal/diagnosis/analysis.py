@@ -18,6 +18,9 @@ from robcal.physics.family import Array, Constants, Family
 from robcal.physics.library import all_families
 from robcal.physics.site import RobotSite
 
+OWN_LEVEL = 0.05
+"""Family-wise level that a family has to reach by itself before it may be named."""
+
 
 @dataclass(frozen=True)
 class Analysis:
@@ -46,6 +49,13 @@ class Analysis:
     def top(self, chosen: Array) -> int:
         """Most probable family among the chosen ones."""
         return int(np.argmax(np.where(chosen, self.ranked.log_weight, -np.inf)))
+
+    def significant(self) -> Array:
+        """Families (f,) whose best entry is significant family-wise, or, if none is, the one with the best entry."""
+        log_p = np.zeros(len(self.families))
+        np.minimum.at(log_p, self.result.family, self.result.log_p)
+        found = np.array([self.family_wise.probability(float(value)) <= OWN_LEVEL for value in log_p])
+        return found if np.any(found) else log_p == log_p.min()
 
     def constants(self, family: int) -> Constants:
         """Best grid point of a family."""

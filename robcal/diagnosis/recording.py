@@ -329,7 +329,7 @@ def fit(
             scale = float(np.sqrt(left @ left / max(len(left) - width, 1)))
         theta[columns] += step
         change = float(np.sum((jacobian[:, : len(columns)] @ step) ** 2))
-        if change < 1e-10 or abs(previous - change) < 1e-14:
+        if change < 1e-6 or abs(previous - change) < 1e-14:
             break
         previous = change
     frames, residual, jacobian = linearised()

@@ -189,9 +189,13 @@ def _is_blunder(look: Analysis, settings: SelectionSettings) -> bool:
 
 
 def choose(look: Analysis, open_to: Array | None = None) -> tuple[int, Constants] | None:
-    """The family to be added: best name or, where that explains less, the best empirical term."""
+    """The family to be added: best name or, where that explains less, the best empirical term.
+
+    Only families that a test finds by themselves: evidence alone would take whatever costs little and explains nothing
+    where the effect has many parameters, each against a wide prior.
+    """
     options: list[tuple[float, int, Constants]] = []
-    allowed = np.ones(len(look.families), dtype=bool) if open_to is None else open_to
+    allowed = look.significant() if open_to is None else look.significant() & open_to
     for chosen in (look.named & allowed, ~look.named & allowed):
         if not np.any(chosen & np.isfinite(look.ranked.log_weight)):
             continue
