@@ -101,7 +101,7 @@ def diagnose(
         whole = noise.apply(recording)
         everything = (*curves.accepted, *chosen.accepted)
         final = fit(replace(bare_model, terms=model.terms), whole, chosen.free, everything)
-    found = _findings(bare_model, chosen, silent, verify, fit(bare_model, chosen.recording, bare))
+    found = _findings(bare_model, chosen, silent | tied, verify, fit(bare_model, chosen.recording, bare))
     findings = (*exchanged, *of_curves, *found)
     heldout = (
         _error(chosen.recording, before, verify),
@@ -249,7 +249,7 @@ def _error(recording: Recording, fitted: Fit, verify: Recording | None) -> float
 def _findings(
     model: RobotModel, chosen: Selection, silent: frozenset[str], verify: Recording | None, before: Fit
 ) -> tuple[Finding, ...]:
-    """What was accepted, without parameters of the standard model that merely came back (`silent`)."""
+    """What was accepted, without parameters that the identification had in its choice and that came back (`silent`)."""
     final = chosen.last.fit
     findings = []
     error = _error(chosen.recording, before, verify)
