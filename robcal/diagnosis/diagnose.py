@@ -135,7 +135,8 @@ def diagnose(
         covariance=final.covariance[: len(final.free), : len(final.free)] * final.variance_factor,
         next_poses=poses,
         seconds=time.perf_counter() - start,
-        region=region_errors(whole, fit(model, whole, free), final) if curves.accepted
+        region=region_errors(whole, fit(model, whole, free), final)
+        if curves.accepted
         else region_errors(chosen.recording, before, last.fit),
     )
 
@@ -317,7 +318,7 @@ def _finding(
     if named >= 0:
         evidence = float(look.ranked.log_weight[named] - np.log(family.weight))
         if family.cause != "unknown":
-            others = rivals(look.families, named, look.ranked, look.stacks, projected, look.named)
+            others = rivals(look.families, named, look.ranked, look.stacks, projected, look.named & look.significant())
     factor = look.result.variance_factor
     covariance = _covariance(look, item, chosen.tied) * factor
     told, sigma = numeric_sigma(family.report, item.values, item.constants, covariance)

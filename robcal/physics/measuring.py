@@ -119,6 +119,7 @@ def _station(data: ObservationData) -> Iterator[Family]:
         )
     if data.kind == "points":
         yield from (_bent_sight(data, axis) for axis in range(3))
+        yield from (_bent_from_origin(axis) for axis in range(3))
         yield replace(_refraction(data), weight=0.25)
     first, every = breaks(data.variables["index"], 3)
 
@@ -150,18 +151,30 @@ def _station(data: ObservationData) -> Iterator[Family]:
     )
 
 
-def _bent_sight(data: ObservationData, axis: int) -> Family:
-    """Light bends evenly across the line of sight: points move by curvature * distance^2 / 2 along one axis.
+def _bend(arm: Array, axis: int) -> Array:
+    """Displacement (m, 3) by unit curvature, seen from where the arms (m, 3) begin: half the squared distance, across
+    the line of sight, towards the axis."""
+    out = -arm * arm[:, axis, None]
+    out[:, axis] += np.sum(arm**2, axis=1)
+    return np.asarray(0.5 * out)
 
-    The distance is from where the instrument stands, which is not known: its place enters by the linear part.
+
+def _bent_sight(data: ObservationData, axis: int) -> Family:
+    """Light bends evenly across the line of sight: points move by curvature * distance^2 / 2 towards one axis.
+
+    The distance is from where the instrument stands, which is not known: with `w` its place from the centre `c`, the
+    bend is that seen from `c` plus terms linear in `p - c` and in `w`.
     """
     centre = data.p_world.mean(axis=0)
 
     def bent(d: ObservationData, c: Constants) -> Array:
         arm = d.p_world - centre
         out = np.zeros((len(arm), 3, 4))
-        out[:, axis, 0] = 0.5 * np.sum(arm**2, axis=1)
-        out[:, axis, 1:] = arm
+        out[:, :, 0] = _bend(arm, axis)
+        for k in range(3):
+            out[:, axis, k + 1] -= 2.0 * arm[:, k]
+            out[:, k, k + 1] += arm[:, axis]
+        out[:, :, axis + 1] += arm
         return out
 
     names = ("curvature", "x", "y", "z")
@@ -169,16 +182,42 @@ def _bent_sight(data: ObservationData, axis: int) -> Family:
 
     def report(v: Array, c: Constants) -> dict[str, object]:
         middle = ", ".join(f"{m:.3f}" for m in centre)
-        law = f"d{letter} = {v[0]:.4g} |p - c|^2 / 2 + ({v[1]:.4g}, {v[2]:.4g}, {v[3]:.4g}) (p - c), c = ({middle}) m"
+        law = (
+            f"{v[0]:.4g} (|a|^2 {letter} - a (a.{letter})) / 2 + a (w.{letter}) + w (a.{letter}) - 2 (a.w) {letter}; "
+            f"a = p - ({middle}) m, w = ({v[1]:.4g}, {v[2]:.4g}, {v[3]:.4g})"
+        )
         return {
             "curvature_per_km": 1e3 * float(v[0]),
             "term": {"variables": ["x_m", "y_m", "z_m"], "kind": "formula", "formula": law},
         }
 
     return Family(
-        "refraction", "camera", "station", letter, names, (2e-5, 5e-5, 5e-5, 5e-5), report,
+        "refraction", "camera", "station", letter, names, (2e-5, 1e-4, 1e-4, 1e-4), report,
         "The lines of sight of the station bend along {direction} (refraction), {curvature_per_km:.4f} per km",
-        displace=bent, weight=0.25,
+        displace=bent, weight=0.125,
+    )  # fmt: skip
+
+
+def _bent_from_origin(axis: int) -> Family:
+    """The same for an instrument that stands where its coordinates begin, as trackers do: one number."""
+
+    def bent(d: ObservationData, c: Constants) -> Array:
+        return _bend(d.p_world, axis)[:, :, None]
+
+    letter = "xyz"[axis]
+
+    def report(v: Array, c: Constants) -> dict[str, object]:
+        term = {
+            "variables": ["x_m", "y_m", "z_m"],
+            "kind": "formula",
+            "formula": f"d = {v[0]:.4g} (|p|^2 {letter} - p (p.{letter})) / 2",
+        }
+        return {"curvature_per_km": 1e3 * float(v[0]), "term": term}
+
+    return Family(
+        "refraction", "camera", "station", letter, ("curvature",), (2e-5,), report,
+        "The lines of sight of the station bend along {direction} (refraction), {curvature_per_km:.4f} per km",
+        displace=bent, weight=0.125,
     )  # fmt: skip
 
 
