@@ -22,14 +22,21 @@ from robcal.photogrammetry.station_network import StationMarks, StationOrientati
 from robcal.photogrammetry.survey_types import SurveyResult
 from robcal.transforms import Array
 
+DOT_SIZES = "dot_sizes"
+"""Artifact of the station: diameters of dots that its images show and no file states."""
+
 
 @dataclass(frozen=True)
 class ImageFindings:
-    """Findings of all surveys and the station, the scans behind them, and the factor by which the marks scatter."""
+    """Findings of all surveys and the station, the scans behind them, and the factor by which the marks scatter.
+
+    `taken_back`: those of the findings that the station was oriented with, so that nothing of them is in its frames.
+    """
 
     findings: tuple[ImageFinding, ...]
     scans: tuple[ImageDiagnosis, ...]
     noise: float
+    taken_back: tuple[ImageFinding, ...] = ()
 
 
 def images_of(campaign: Campaign, run: Run) -> ImageFindings:
@@ -37,6 +44,7 @@ def images_of(campaign: Campaign, run: Run) -> ImageFindings:
     findings: list[ImageFinding] = []
     scans: list[ImageDiagnosis] = []
     noise = [1.0]
+    taken_back: tuple[ImageFinding, ...] = ()
     cameras: dict[str, Camera] = {}
     if run.record("survey") is not None:
         for name, source in campaign.bodies.items():
@@ -60,14 +68,15 @@ def images_of(campaign: Campaign, run: Run) -> ImageFindings:
         swapped = exchanged_targets(orientation, marks, given)
         explained = frozenset(str(name) for f in swapped for name in (f.where, f.parameters["with"]))
         stated = given_points(orientation, given)
-        findings += swapped
+        taken_back = tuple(run.load(DOT_SIZES)) if run.has(DOT_SIZES) else ()
+        findings += [*taken_back, *swapped]
         findings += station_findings(orientation, tuple(names), stated, data.inflation, explained)
         scans.append(diagnose_images(data))
         noise.append(orientation.sigma0)
         cameras |= dict(zip(orientation.names, orientation.cameras, strict=True))
     for scan in scans:
         findings += scan.findings
-    return ImageFindings(beyond_lenses(findings, cameras), tuple(scans), max(noise))
+    return ImageFindings(beyond_lenses(findings, cameras), tuple(scans), max(noise), taken_back)
 
 
 def image_covariates(campaign: Campaign) -> Mapping[str, Array]:

@@ -102,7 +102,7 @@ def work(context: Context) -> Outcome:
         free,
         tied,
         verify,
-        settings_beside(settings_of(campaign), images.findings),
+        settings_beside(settings_of(campaign), [f for f in images.findings if f not in images.taken_back]),
         context.messages.info,
         cross_elasticities(found),
     )

@@ -12,7 +12,8 @@ import numpy as np
 from pipeline.bodies import surveyed_or_given
 from pipeline.camera_file import CameraFile, write_camera
 from pipeline.campaign import Campaign, ImageSource
-from pipeline.image_findings import image_covariates
+from pipeline.dot_sizes import with_dot_sizes
+from pipeline.image_findings import DOT_SIZES, image_covariates
 from pipeline.measurement_tables import MarksTable
 from pipeline.moved_cameras import which_moved, with_small_moves
 from pipeline.poses_table import Poses
@@ -21,6 +22,7 @@ from pipeline.stages.base import Context, Outcome, Stage
 from pipeline.stages.detect import DetectionIndex, load_detections
 from pipeline.stages.survey import located, size_of_marks
 from robcal.diagnosis.image_data import ImageData
+from robcal.diagnosis.image_diagnosis import ImageFinding
 from robcal.diagnosis.image_station import station_data
 from robcal.errors import InvalidInput, RobcalError
 from robcal.imaging.detections import Detections
@@ -56,23 +58,27 @@ def work(context: Context) -> Outcome:
     }
     sizes = {name: _size(campaign.cameras[name], run, name) for name in marks}
 
+    carried = body
+
     def orient(settings: StationSettings) -> StationOrientation:
-        return orient_station(marks, body, {n: start[n] for n in marks}, sizes, stated, settings)
+        return orient_station(marks, carried, {n: start[n] for n in marks}, sizes, stated, settings)
 
     def data(orientation: StationOrientation) -> ImageData:
         return station_data(orientation, poses.names, body, start, image_covariates(campaign))
 
     try:
+        sized: tuple[ImageFinding, ...] = ()
         if campaign.entry.diagnosis.enabled:
+            carried, sized = with_dot_sizes(body, lambda: data(orient(StationSettings())))
             orientation, again = with_small_moves(orient, data)
             orientation = which_moved(orientation, again, campaign, marks)
         else:
             orientation = orient(StationSettings())
     except RobcalError as error:
         raise located(error, f"{campaign.path}: station") from None
-    outputs = [run.save(NAME, orientation), run.save("marks", marks)]
+    outputs = [run.save(NAME, orientation), run.save("marks", marks), run.save(DOT_SIZES, list(sized))]
     outputs += _write_cameras(campaign, run, orientation)
-    notes += [e.statement for e in orientation.evidence]
+    notes += [f.statement for f in sized] + [e.statement for e in orientation.evidence]
     whole = [r for r in orientation.rejected if r.target < 0]
     notes += [f"camera {r.camera}, pose '{poses.names[r.pose]}': {r.reason}" for r in whole]
     return Outcome({"station": _result(orientation, marks)}, outputs, notes)
@@ -219,5 +225,6 @@ STAGE = Stage(
         "robcal/transforms.py",
         "pipeline/stages/orient.py",
         "pipeline/moved_cameras.py",
+        "pipeline/dot_sizes.py",
     ),
 )

@@ -17,7 +17,8 @@ class ImageCause:
     `plausible` refuses estimates that physics forbids; `least_gain` is the share by which the prediction of marks must
     improve for the cause to be worth a name; `twins` are (cause, where) of others with the very same columns; `pose`
     the first image of a moved camera; `bends`: told from a smooth field over the image only by its form; `once`: the
-    other candidates of that name and place are the same cause with other constants.
+    other candidates of that name and place are the same cause with other constants; `places`: what it is told of, one
+    by one, where it acts in several (`where` is then a name for all of them).
     """
 
     cause: str
@@ -35,6 +36,12 @@ class ImageCause:
     pose: int | None = None
     bends: bool = False
     once: bool = True
+    places: tuple[str, ...] = ()
+
+    @property
+    def told_of(self) -> tuple[str, ...]:
+        """All places."""
+        return self.places or (self.where,)
 
 
 def only(rows: Array, values: Array) -> Array:

@@ -28,11 +28,11 @@ def image_causes(data: ImageData, moves: bool = True) -> Iterator[ImageCause]:
         if np.any(rows):
             yield from _lens(data, c, name, rows)
             yield from refraction_causes(data, c, name, rows)
-            yield from _eccentricity(data, c, name, rows)
             yield from _bias(data, name, rows)
             yield _field(data, c, name, rows)
             if moves and data.by_exterior is not None:
                 yield from _moves(data, name, rows)
+    yield from _eccentricity(data)
     if data.by_target is not None:
         yield from _targets(data, data.by_target)
         yield from _growth(data, data.by_target)
@@ -79,15 +79,28 @@ def _lens(data: ImageData, c: int, name: str, rows: Array) -> Iterator[ImageCaus
         )
 
 
-def _eccentricity(data: ImageData, c: int, name: str, rows: Array) -> Iterator[ImageCause]:
-    if not data.dots or np.any(data.radii[rows] > 0) or not np.any(np.isfinite(data.normal_camera[rows])):
+def _eccentricity(data: ImageData) -> Iterator[ImageCause]:
+    """Dots whose size the model does not know: the same dots in the images of all cameras.
+
+    Weakness: one diameter for all of them.
+    """
+    if not data.dots or np.any(data.radii > 0):
         return
     radius = 5e-3
-    shift = centre_shift(data.cameras[c], data.p_camera, data.normal_camera, np.where(rows, radius, 0.0))
+    shift = np.zeros_like(data.xy)
+    seen = np.isfinite(data.normal_camera).all(axis=1)
+    for c in np.unique(data.camera[seen]):
+        rows = seen & (data.camera == c)
+        shift[rows] = centre_shift(
+            data.cameras[c], data.p_camera[rows], data.normal_camera[rows], np.full(int(rows.sum()), radius)
+        )
+    names = tuple(name for c, name in enumerate(data.names) if np.any(shift[data.camera == c]))
+    if not names:
+        return
     yield ImageCause(
         "ellipse_eccentricity",
         "image",
-        name,
+        names[0] if len(names) == 1 else "station",
         None,
         shift[:, :, None] / radius**2,
         np.array([1e-4]),
@@ -95,6 +108,7 @@ def _eccentricity(data: ImageData, c: int, name: str, rows: Array) -> Iterator[I
         "Dots seen obliquely by {where} show off their centres as dots of {diameter_mm:.1f} mm do",
         bends=True,
         plausible=lambda v: float(v[0]) > 0,
+        places=names,
     )
 
 

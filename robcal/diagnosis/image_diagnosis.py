@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,6 +23,8 @@ RUNS = 200
 NEARLY_AS_GOOD = 3.0
 """Logarithm of the odds within which another cause stays a rival."""
 ADEQUATE = 1e-3
+DEGENERATE = 1e-6
+"""Singular values below this share of the largest are directions that the images do not show."""
 LEFT_OVER = 0.2
 """Significance of a smooth field beside a named cause, and its share of what that explains, from which the name does
 not hold."""
@@ -58,6 +60,20 @@ class ImageDiagnosis:
     heldout_px: tuple[float, float, float]
 
 
+@dataclass(frozen=True)
+class _Accepted:
+    """A cause that was accepted: whitened columns (r, q) beside the images' unknowns, per `cause.sizes`."""
+
+    cause: ImageCause
+    columns: Array
+    values: Array
+    covariance: Array
+    inflation: float
+    p_value: float
+    rivals: tuple[tuple[str, str], ...]
+    heldout_px: tuple[float, float]
+
+
 def diagnose_images(data: ImageData, *, moves: bool = True, level: float = LEVEL, seed: int = 0) -> ImageDiagnosis:
     """Find what the model of the images leaves out.
 
@@ -69,13 +85,13 @@ def diagnose_images(data: ImageData, *, moves: bool = True, level: float = LEVEL
     listed = [entry for entry in listed if np.all(np.isfinite(entry.columns))]
     residual, added = data.residual, np.zeros((len(data.residual), 0))
     redundancy = data.redundancy.reshape(-1).copy()
-    findings: list[ImageFinding] = []
+    accepted: list[_Accepted] = []
     predicted = _predicted(data, residual, redundancy)
     before = predicted
     level_of = None
     fields: dict[str, Array] = {}
     last_p = dropped_p = 1.0
-    while listed and len(findings) <= MOST:
+    while listed and len(accepted) <= MOST:
 
         def remove(columns: Array, basis: Array = added) -> Array:
             return _without(basis, data.remove(columns))
@@ -87,7 +103,7 @@ def diagnose_images(data: ImageData, *, moves: bool = True, level: float = LEVEL
         fields = fields or _fields(causes, stacks)
         level_of = level_of or simulate(stacks, remove, freedom, len(residual), runs=RUNS, seed=seed)
         last_p = level_of.probability(float(result.log_p[result.best]))
-        if last_p > level or len(findings) == MOST:
+        if last_p > level or len(accepted) == MOST:
             break
         chosen, score = _best(causes, result, level_of, level)
         near = list(neighbouring_moves(data, causes[chosen])) if causes[chosen].pose is not None else []
@@ -109,26 +125,17 @@ def diagnose_images(data: ImageData, *, moves: bool = True, level: float = LEVEL
             listed = [entry for entry in listed if entry.family != chosen]
             continue
         residual, redundancy = left, remaining
-        told, spread = cause.report(values), covariance * inflation[chosen]
-        findings.append(
-            ImageFinding(
-                cause.cause,
-                cause.stage,
-                cause.where,
-                cause.direction,
-                told,
-                _sigma(cause, values, spread),
-                last_p,
-                _rivals(causes, score, chosen),
-                (predicted, after),
-                _sentence(cause, told),
-            )
+        rivals = _rivals(causes, score, chosen)
+        columns = remove(data.whiten(cause.columns) * cause.sizes, np.zeros((len(residual), 0)))
+        accepted.append(
+            _Accepted(cause, columns, values, covariance, float(inflation[chosen]), last_p, rivals, (predicted, after))
         )
         if cause.once:
             same = {i for i, c in enumerate(causes) if (c.cause, c.where) == (cause.cause, cause.where)}
             listed = [entry for entry in listed if entry.family not in same]
         predicted = after
         added = np.concatenate([added, basis], axis=1)
+    findings = [f for item in _together(accepted, data, residual) for f in _findings(item)]
     left_over = min(last_p, dropped_p)
     if left_over < ADEQUATE:
         # images that are bent in a manner which nothing explains make single targets look displaced
@@ -138,6 +145,44 @@ def diagnose_images(data: ImageData, *, moves: bool = True, level: float = LEVEL
     return ImageDiagnosis(tuple(findings), p_value, left_over, (before, predicted, floor))
 
 
+def _together(accepted: Sequence[_Accepted], data: ImageData, residual: Array) -> list[_Accepted]:
+    """Values and covariances of all accepted causes estimated beside each other.
+
+    Each was found before the later ones were known, whose share its first estimate has in it. One whose own value
+    would then be none that physics allows keeps its first.
+    """
+    if len(accepted) < 2:
+        return list(accepted)
+    size = np.concatenate([item.cause.sizes for item in accepted])
+    U, s, Vt = np.linalg.svd(np.concatenate([item.columns for item in accepted], axis=1), full_matrices=False)
+    seen = s > DEGENERATE * s[0]
+    inverse = Vt[seen].T / s[seen]
+    values = inverse @ (U[:, seen].T @ data.residual) * size
+    variance = float(residual @ residual) / max(data.freedom - int(seen.sum()), 1)
+    covariance = variance * (inverse @ inverse.T) * np.outer(size, size)
+    out, at = [], 0
+    for item in accepted:
+        own = slice(at, at + len(item.values))
+        at = own.stop
+        if item.cause.plausible(values[own]):
+            item = replace(item, values=values[own], covariance=covariance[own, own])
+        out.append(item)
+    return out
+
+
+def _findings(item: _Accepted) -> Iterator[ImageFinding]:
+    """A cause as told, at each of its places."""
+    cause = item.cause
+    told = cause.report(item.values)
+    sigma = _sigma(cause, item.values, item.covariance * item.inflation)
+    for where in cause.told_of:
+        text = _sentence(cause, told, where)
+        yield ImageFinding(
+            cause.cause, cause.stage, where, cause.direction, told, sigma, item.p_value, item.rivals, item.heldout_px,
+            text,
+        )  # fmt: skip
+
+
 def _adequate(
     fields: Mapping[str, Array], cause: ImageCause, basis: Array, residual: Array, freedom: int
 ) -> bool:
@@ -145,11 +190,12 @@ def _adequate(
 
     What a lens model leaves over looks partly like refraction; the name holds only if it explains (nearly) all of it.
     """
-    if not cause.bends or cause.where not in fields:
+    known = [fields[name] for name in cause.told_of if name in fields]
+    if not cause.bends or not known:
         return True
     explained = float(np.sum((basis.T @ residual) ** 2))
     left = _without(basis, residual)
-    beside = orthonormal_basis(_without(basis, fields[cause.where]))
+    beside = orthonormal_basis(_without(basis, np.concatenate(known, axis=1)))
     raw, count = float(np.sum((beside.T @ left) ** 2)), beside.shape[1]
     total = float(left @ left)
     log_p = float(log_f_probability(np.array(raw), np.array(count), total, freedom - basis.shape[1]))
@@ -244,13 +290,12 @@ def _sigma(cause: ImageCause, values: Array, covariance: Array) -> dict[str, obj
 
 
 def _rivals(causes: Sequence[ImageCause], score: Array, chosen: int) -> tuple[tuple[str, str], ...]:
-    own = (causes[chosen].cause, causes[chosen].where)
+    own = {(causes[chosen].cause, where) for where in causes[chosen].told_of}
     near = [i for i in np.argsort(-score) if score[i] > score[chosen] - NEARLY_AS_GOOD and causes[i].cause != "unknown"]
-    listed = dict.fromkeys([*causes[chosen].twins, *((causes[i].cause, causes[i].where) for i in near)])
-    listed.pop(own, None)
-    return tuple(listed)
+    listed = dict.fromkeys([*causes[chosen].twins, *((causes[i].cause, w) for i in near for w in causes[i].told_of)])
+    return tuple(rival for rival in listed if rival not in own)
 
 
-def _sentence(cause: ImageCause, told: dict[str, object]) -> str:
+def _sentence(cause: ImageCause, told: dict[str, object], where: str) -> str:
     shown = {k: ", ".join(f"{x:.3f}" for x in v) if isinstance(v, list) else v for k, v in told.items()}
-    return cause.sentence.format(where=cause.where, **shown)
+    return cause.sentence.format(where=where, **shown)

@@ -122,13 +122,37 @@ def _displaced(data, shift):
     return replace(data, residual=data.residual + data.remove(data.whiten(shift[:, :, None]))[:, 0])
 
 
-def test_dots_of_unstated_size_that_show_off_their_centres():
+def _eccentric(data, radius):
+    shift = np.zeros_like(data.xy)
+    for c, camera in enumerate(data.cameras):
+        rows = data.camera == c
+        size = np.full(rows.sum(), radius)
+        shift[rows] = centre_shift(camera, data.p_camera[rows], data.normal_camera[rows], size)
+    return shift
+
+
+def test_dots_of_unstated_size_have_one_diameter_for_all_cameras():
     data = _dots(11)
-    rows = data.camera == 1
-    shift = centre_shift(data.cameras[1], data.p_camera, data.normal_camera, np.where(rows, 0.02, 0.0))
-    (found,) = diagnose_images(_displaced(data, shift)).findings
-    assert (found.cause, found.stage, found.where) == ("ellipse_eccentricity", "image", data.names[1])
-    assert abs(found.parameters["diameter_mm"] - 40.0) < 4.0 * found.sigma["diameter_mm"]
+    found = diagnose_images(_displaced(data, _eccentric(data, 0.02))).findings
+    assert [(f.cause, f.stage, f.where) for f in found] == [
+        ("ellipse_eccentricity", "image", name) for name in data.names
+    ]
+    assert len({f.parameters["diameter_mm"] for f in found}) == 1
+    assert abs(found[0].parameters["diameter_mm"] - 40.0) < 4.0 * found[0].sigma["diameter_mm"]
+    assert found[0].rivals == ()
+    assert data.names[1] in found[1].statement
+
+
+def test_causes_are_estimated_beside_each_other():
+    data = _dots(11)
+    bias = 0.3 * (data.camera == 0)[:, None] * data.normal_camera[:, :2]
+    found = diagnose_images(_displaced(data, _eccentric(data, 0.02) + bias)).findings
+    by_cause = {f.cause: f for f in found}
+    assert set(by_cause) == {"ellipse_eccentricity", "centroid_bias"}
+    dots, biased = by_cause["ellipse_eccentricity"], by_cause["centroid_bias"]
+    assert abs(dots.parameters["diameter_mm"] - 40.0) < 4.0 * dots.sigma["diameter_mm"]
+    # found first, its first estimate has the other's share in it: six standard deviations
+    assert abs(biased.parameters["px"] - 0.3) < 4.0 * biased.sigma["px"]
 
 
 def test_centres_displaced_along_the_tilt_of_dots():
