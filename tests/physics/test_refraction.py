@@ -29,7 +29,7 @@ def bend_from(points: np.ndarray, viewpoint: np.ndarray, up: np.ndarray) -> np.n
 @pytest.mark.parametrize("axis", range(3))
 def test_the_law_covers_every_viewpoint(axis: int) -> None:
     rng = np.random.default_rng(axis)
-    points = rng.normal(size=(30, 3)) + [2.0, -1.0, 0.5]
+    points = rng.normal(size=(30, 3)) + np.array([2.0, -1.0, 0.5])
     seen = data(points)
     named = [f for f in measuring_families(seen, (0, 1, 2, 3, 4), "plate") if f.cause == "refraction"]
     general = next(f for f in named if f.direction == AXES[axis] and len(f.parameters) == 4)
@@ -44,7 +44,7 @@ def test_the_law_covers_every_viewpoint(axis: int) -> None:
 
 
 def test_an_instrument_at_the_origin_needs_one_number() -> None:
-    points = np.random.default_rng(4).normal(size=(20, 3)) + [0.0, 3.0, 0.0]
+    points = np.random.default_rng(4).normal(size=(20, 3)) + np.array([0.0, 3.0, 0.0])
     seen = data(points)
     named = [f for f in measuring_families(seen, (0, 1, 2, 3, 4), "plate") if f.cause == "refraction"]
     upright = next(f for f in named if f.direction == "z" and len(f.parameters) == 1)
