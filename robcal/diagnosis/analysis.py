@@ -10,7 +10,7 @@ import numpy as np
 from robcal.diagnosis.blunders import Suspect, worst_group
 from robcal.diagnosis.candidates import Tangents, entries, tangents
 from robcal.diagnosis.empirical import empirical_families
-from robcal.diagnosis.family_wise import FamilyWise, simulate
+from robcal.diagnosis.family_wise import FamilyWise, simulate, tails
 from robcal.diagnosis.naming import Posterior, posterior
 from robcal.diagnosis.recording import Accepted, Fit, Recording
 from robcal.diagnosis.scan import ScanResult, Stack, orthonormal_basis, restack, scan, stack_entries
@@ -110,10 +110,14 @@ def _look(
     redundancy = len(residual) - basis.shape[1]
     result = scan(stacks, residual, redundancy)
     ranked = posterior(families, result)
-    family_wise = level if level is not None else simulate(stacks, basis, redundancy, len(residual), runs=runs)
+    groups = at.recording.row_groups(len(residual))
+    family_wise = level
+    if family_wise is None:
+        freedom = tails(residual, redundancy)
+        family_wise = simulate(stacks, basis, redundancy, len(residual), runs=runs, freedom=freedom, block=groups)
     p_value = family_wise.probability(float(result.log_p[result.best]))
     named = np.array([family.cause != "unknown" for family in families])
-    suspect = worst_group(residual, basis, at.recording.row_groups(len(residual)))
+    suspect = worst_group(residual, basis, groups)
     return Analysis(
         fit,
         at,
