@@ -13,6 +13,7 @@ from pipeline.report.image_cause_plots import gains_figure, lens_figure
 from pipeline.report.material import Material
 from pipeline.report.robot_plot import robot_figure
 from pipeline.report.style import AFTER, BEFORE, GREY, label, layout, number, percent, probability, rounded, to_sigma
+from robcal.calibration.observations import PointObservations
 from robcal.photogrammetry.camera import Camera
 from robcal.transforms import Array
 
@@ -208,7 +209,8 @@ def _gain(material: Material, d: Mapping[str, Any]) -> list[Block]:
     kept = "marks, each predicted without itself," if unit == "px" else kept
     floor = held.get("noise_floor")
     before, after = number(held.get("before")), number(held.get("after"))
-    text = f"On {kept} the error is {before} {unit} (RMS) before and {after} after"
+    what = "error of single measured points" if unit == "mm" and _on_points(material) else "error"
+    text = f"On {kept} the {what} is {before} {unit} (RMS) before and {after} after"
     text += f"; the noise of the measurement alone gives {number(floor)} {unit}." if floor else "."
     region = held.get("region")
     if region and d.get("mismatch"):
@@ -238,6 +240,12 @@ def _gain(material: Material, d: Mapping[str, Any]) -> list[Block]:
                    "Errors of kept-out poses before and after the diagnosis", height=300)
         )  # fmt: skip
     return blocks
+
+
+def _on_points(material: Material) -> bool:
+    """Whether the diagnosis worked on single points; the verification tells of whole poses, whose noise is less."""
+    found = material.identification
+    return found is not None and any(isinstance(o, PointObservations) for o in found.recording.detailed)
 
 
 def _rivals(cause: Mapping[str, Any]) -> list[Block]:
