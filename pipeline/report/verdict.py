@@ -9,6 +9,7 @@ from pipeline.report.diagnosis_chapter import short_statement
 from pipeline.report.material import Material
 from pipeline.report.style import number, percent
 from pipeline.report.verification_chapter import error_table, noise_by_tool
+from robcal.calibration.observations import FrameObservations
 from robcal.calibration.verification import Verification
 
 LEVEL = 0.01
@@ -83,6 +84,7 @@ def _robot(material: Material, v: Verification) -> Verdict:
     reason = f"{kept}; {percent(v.coverage_95)} of them lie inside the predicted 95 % region."
     if "0" in noise:
         reason += f" The measurement alone scatters by {number(noise['0'] * 1e3)} mm (RMS) at the tool's origin."
+    reason += _taken_out(material, v)
     load = (
         "robot_calibrated.yaml; corrected targets or joint angles by 'pipeline compensate', code for the controller by "
         "'pipeline export'."
@@ -93,6 +95,29 @@ def _robot(material: Material, v: Verification) -> Verdict:
         grade, word, f"{change}{but}.", reason, load, told_diagnosis(material), _keys(material, v, noise, gain),
         error_table(v, noise, full=False),
     )  # fmt: skip
+
+
+def _taken_out(material: Material, v: Verification) -> str:
+    """What was taken out of the measured frames before they were compared, and how far the prediction is to be trusted.
+
+    Errors that all poses share (place and lens of the cameras, coordinates of the body) do not show in the comparison;
+    the predicted standard deviation holds them.
+    """
+    freed = material.artifact("corrected", "diagnose")
+    if freed is None or material.identification is None:
+        return ""
+    shifts = [
+        np.linalg.norm(a.world_T_tool[:, :3, 3] - b.world_T_tool[:, :3, 3], axis=1)
+        for a, b in zip(material.identification.recording.observations, freed.observations, strict=True)
+        if isinstance(a, FrameObservations) and isinstance(b, FrameObservations)
+    ]
+    if not shifts:
+        return ""
+    moved, sigma = (1e3 * float(np.sqrt(np.mean(x**2))) for x in (np.concatenate(shifts), v.predicted))
+    return (
+        f" Errors of the measuring system that were estimated from all poses together ({number(moved, 2)} mm RMS) are "
+        f"taken out of this comparison; with them, a predicted place is known to {number(sigma, 2)} mm a direction."
+    )
 
 
 def _keys(material: Material, v: Verification, noise: dict[str, float], gain: float) -> tuple[KeyFigure, ...]:
