@@ -91,7 +91,7 @@ def _summary(done: Any) -> dict[str, Any]:
     }
 
 
-@app.command()
+@app.command(short_help="All stages that the campaign has input for.")
 def run(
     campaign: CampaignPath,
     out: Annotated[Path | None, typer.Option("--out", help="Run folder; default runs/<campaign name>.")] = None,
@@ -128,11 +128,13 @@ def survey(
     with _answers("survey", as_json) as answer:
         from pipeline.commands import survey_campaign
 
-        done = survey_campaign(campaign, body, out, Messages(quiet), workers)
+        messages = Messages(quiet)
+        done = survey_campaign(campaign, body, out, messages, workers)
         answer.update(_summary(done))
+        messages.info(f"results in {done.run.folder}")
 
 
-@app.command()
+@app.command(short_help="Only the diagnosis: what physics the model lacks.")
 def diagnose(
     place: Annotated[Path, typer.Argument(metavar="CAMPAIGN_OR_RUN", help="Campaign folder or run folder.")],
     out: Annotated[Path | None, typer.Option("--out", help="Run folder, when a campaign is named.")] = None,
@@ -153,7 +155,7 @@ def diagnose(
             messages.info("nothing missing: model and recordings agree within their noise")
 
 
-@app.command()
+@app.command(short_help="Where the calibrated robot's tool really is.")
 def predict(
     run_folder: RunFolder,
     poses: Annotated[Path, typer.Option("--poses", help="Joint angles: pose, q1_deg, ... as in poses.csv.")],
@@ -172,7 +174,7 @@ def predict(
         Messages(quiet).info(f"{answer['poses']} frames in {out}")
 
 
-@app.command()
+@app.command(short_help="Commands that bring the tool where it should be.")
 def compensate(
     run_folder: RunFolder,
     frames: Annotated[Path, typer.Option("--frames", help="Wanted tool frames; column payload if loads differ.")],
@@ -210,7 +212,14 @@ def compensate(
         messages = Messages(quiet)
         for sentence in answer["warnings"]:
             messages.warn(sentence)
-        messages.info(f"{answer['frames']} rows in {out}, remaining error at most {answer['remaining_max_mm']:.4f} mm")
+        if program == "rapid" and targets:
+            messages.warn(f"{out}: the tool data 'tool_robcal' must be declared in the controller: the body's frame")
+        if program and targets and not in_base:
+            messages.warn(f"{out}: its targets are in the measuring system's coordinates, not in the robot's base; "
+                          "controllers want --in base")  # fmt: skip
+        remaining = answer["remaining_max_mm"]
+        told = f"at most {remaining:.2g} mm" if remaining >= 1e-4 else "below 0.0001 mm"
+        messages.info(f"{answer['frames']} rows in {out}, remaining error {told}")
 
 
 @app.command()
@@ -224,7 +233,7 @@ def report(run_folder: RunFolder, quiet: Quiet = False, as_json: Json = False) -
         Messages(quiet).info(str(path))
 
 
-@app.command()
+@app.command(short_help="Render a small campaign and run it.")
 def demo(
     out: Annotated[Path, typer.Option("--out", help="Folder for the rendered campaign and its run.")] = Path("demo"),
     workers: Workers = None,
@@ -241,7 +250,7 @@ def demo(
             typer.echo(str(done.run.report))
 
 
-@app.command()
+@app.command(short_help="Generate measuring poses for a campaign.")
 def poses(
     config: Annotated[Path, typer.Argument(metavar="CONFIG", help="YAML file of the format robcal/poses-1.")],
     out: Annotated[Path, typer.Option("--out", help="Table of poses to write.")],
@@ -259,7 +268,7 @@ def poses(
         messages.info(f"{answer['poses']} poses in {out}")
 
 
-@app.command()
+@app.command(short_help="C99 and URDF of the calibrated robot.")
 def export(
     run_folder: RunFolder,
     c: Annotated[Path | None, typer.Option("--c", help="Folder for C99 source of the model and its inverse.")] = None,

@@ -12,8 +12,10 @@ from pipeline.report.evidence_plots import evidence_figure
 from pipeline.report.image_cause_plots import gains_figure, lens_figure
 from pipeline.report.material import Material
 from pipeline.report.robot_plot import robot_figure
-from pipeline.report.style import AFTER, BEFORE, GREY, label, layout, number, percent, probability, rounded
+from pipeline.report.style import AFTER, BEFORE, GREY, label, layout, number, percent, probability, rounded, to_sigma
+from robcal.calibration.observations import PointObservations
 from robcal.photogrammetry.camera import Camera
+from robcal.transforms import Array
 
 LEVEL = 0.01
 _NAMES = {
@@ -145,11 +147,7 @@ def _parameter(name: str, value: Any, sigma: Any) -> str:
 def _with_sigma(value: Any, sigma: Any) -> str:
     if isinstance(value, str) or not sigma:
         return number(value)
-    digits = 3
-    if value and sigma and np.isfinite(float(sigma)) and float(sigma) > 0:
-        # as many figures as the sigma has two of
-        digits = int(np.clip(np.floor(np.log10(abs(value))) - np.floor(np.log10(float(sigma))) + 2, 1, 6))
-    return f"{number(value, digits)} ± {number(sigma, 2)}"
+    return f"{to_sigma(float(value), float(sigma))} ± {number(sigma, 2)}"
 
 
 def _plots(material: Material, causes: list[dict[str, Any]]) -> list[Block]:
@@ -169,9 +167,9 @@ def _image_plots(material: Material, causes: list[dict[str, Any]]) -> list[Block
     """The lens' curve where radial distortion was found; what each gains where there are several."""
     blocks: list[Block] = []
     lenses = {str(c.get("where")) for c in causes if c.get("cause") == "lens_radial"}
-    for name, (camera, covariance) in _cameras(material).items():
+    for name, (camera, covariance, marks) in _cameras(material).items():
         if name in lenses:
-            blocks.append(lens_figure(f"camera {name}", camera, covariance))
+            blocks.append(lens_figure(f"camera {name}", camera, covariance, marks))
     d = material.diagnosis or {}
     for key in ("heldout_px", "heldout_mm"):
         mine = [c for c in causes if c.get(key)]
@@ -182,18 +180,24 @@ def _image_plots(material: Material, causes: list[dict[str, Any]]) -> list[Block
     return blocks
 
 
-def _cameras(material: Material) -> dict[str, tuple[Camera, Any]]:
-    """Adjusted cameras with the covariance of their interior orientation, by the names the diagnosis gives them."""
-    out: dict[str, tuple[Camera, Any]] = {}
+def _cameras(material: Material) -> dict[str, tuple[Camera, Any, Array]]:
+    """Adjusted cameras with the covariance of their interior orientation and their marks (n, 2) in pixels.
+
+    By the names the diagnosis gives them.
+    """
+    out: dict[str, tuple[Camera, Any, Array]] = {}
     for name, survey in material.surveys.items():
         known = material.campaign.bodies.get(name) if material.campaign is not None else None
         source = known.survey if known is not None else None
         path = source.start_path if source is not None else None
         network = survey.network
-        out[path.stem if path is not None else f"survey_{name}"] = (network.camera, network.intrinsics_covariance)
+        out[path.stem if path is not None else f"survey_{name}"] = (
+            network.camera, network.intrinsics_covariance, network.marks.xy,
+        )  # fmt: skip
     if material.station is not None:
-        for name, camera in zip(material.station.names, material.station.cameras, strict=True):
-            out[name] = (camera, material.station.camera_covariance(name)[1])
+        marks = material.station.marks
+        for c, (name, camera) in enumerate(zip(material.station.names, material.station.cameras, strict=True)):
+            out[name] = (camera, material.station.camera_covariance(name)[1], marks.xy[marks.camera == c])
     return out
 
 
@@ -202,10 +206,11 @@ def _gain(material: Material, d: Mapping[str, Any]) -> list[Block]:
     if not held:
         return []
     kept = "kept-out poses" if held.get("kind") == "verify" else "blocks of poses kept out in turn"
-    kept = "marks, each predicted without itself" if unit == "px" else kept
+    kept = "marks, each predicted without itself," if unit == "px" else kept
     floor = held.get("noise_floor")
     before, after = number(held.get("before")), number(held.get("after"))
-    text = f"On {kept} the error is {before} {unit} (RMS) before and {after} after"
+    what = "error of single measured points" if unit == "mm" and _on_points(material) else "error"
+    text = f"On {kept} the {what} is {before} {unit} (RMS) before and {after} after"
     text += f"; the noise of the measurement alone gives {number(floor)} {unit}." if floor else "."
     region = held.get("region")
     if region and d.get("mismatch"):
@@ -237,21 +242,27 @@ def _gain(material: Material, d: Mapping[str, Any]) -> list[Block]:
     return blocks
 
 
+def _on_points(material: Material) -> bool:
+    """Whether the diagnosis worked on single points; the verification tells of whole poses, whose noise is less."""
+    found = material.identification
+    return found is not None and any(isinstance(o, PointObservations) for o in found.recording.detailed)
+
+
 def _rivals(cause: Mapping[str, Any]) -> list[Block]:
     rivals = cause.get("indistinguishable_from") or []
     if not rivals:
         return []
-    rows = [
-        [said(r.get("cause")), str(r.get("where")), r.get("direction") or "", _share(r.get("probability")),
-         _share(r.get("overlap"))]
-        for r in rivals
-    ]  # fmt: skip
-    return [
-        table(["Rival", "Where", "Direction", "Probability", "Overlap"], rows,
-              f"These explain the recording (nearly) as well as {said(cause.get('cause'))} at {cause.get('where')}: "
-              "overlap is the share of its signature that the rival can reproduce. Predictions within the measured "
-              "range are the same, whichever it is.", text=(0, 1, 2))
-    ]  # fmt: skip
+    rows = [[said(r.get("cause")), str(r.get("where")), r.get("direction") or ""] for r in rivals]
+    columns = ["Rival", "Where", "Direction"]
+    told = f"These explain the recording (nearly) as well as {said(cause.get('cause'))} at {cause.get('where')}. "
+    for key in ("probability", "overlap"):
+        if any(r.get(key) is not None for r in rivals):
+            columns.append(key.capitalize())
+            rows = [[*row, _share(r.get(key))] for row, r in zip(rows, rivals, strict=True)]
+    if "Overlap" in columns:
+        told += "Overlap is the share of its signature that the rival can reproduce. "
+    told += "Predictions within the measured range are the same, whichever it is."
+    return [table(columns, rows, told, text=(0, 1, 2))]
 
 
 def _share(value: Any) -> str:

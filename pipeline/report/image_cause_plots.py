@@ -15,10 +15,17 @@ from robcal.transforms import Array
 _RADIAL = tuple(INTRINSIC_NAMES.index(name) for name in ("k1", "k2", "k3"))
 
 
-def lens_figure(name: str, camera: Camera, covariance: Array) -> Figure:
-    """Radial distortion (px) over the radius, with the band of two sigma from the covariance of k1, k2, k3."""
+def lens_figure(name: str, camera: Camera, covariance: Array, marks: Array) -> Figure:
+    """Radial distortion (px) over the radius, with the band of two sigma from the covariance of k1, k2, k3.
+
+    `marks` (n, 2) in pixels: the curve ends with the outermost, beyond it nothing was seen.
+    """
     corner = np.array([max(camera.cx, camera.width - camera.cx), max(camera.cy, camera.height - camera.cy)])
-    r = np.linspace(0, float(np.hypot(*(corner / [camera.fx, camera.fy]))), 80)
+    end = float(np.hypot(*(corner / [camera.fx, camera.fy])))
+    if len(marks):
+        away = np.linalg.norm((marks - [camera.cx, camera.cy]) / [camera.fx, camera.fy], axis=1)
+        end = min(end, float(away.max()))
+    r = np.linspace(0, end, 80)
     f = 0.5 * (camera.fx + camera.fy)
     J = np.stack([r**3, r**5, r**7], axis=1) * f
     shift = J @ np.array([camera.k1, camera.k2, camera.k3])
@@ -34,7 +41,7 @@ def lens_figure(name: str, camera: Camera, covariance: Array) -> Figure:
         {"type": "scatter", "mode": "lines", "x": [x[0], x[-1]], "y": [0, 0], "name": "camera file",
          "line": {"color": BEFORE, "width": 2, "dash": "dash"}},
     ]  # fmt: skip
-    told = f"Radial distortion of {label(name)}: the camera file has none, the images show this."
+    told = f"Radial distortion of {label(name)} out to the outermost target: the camera file has none, the images do."
     return Figure(tuple(data), layout("distance from the principal point (px)", "radial shift (px)"), told,
                   f"Radial distortion of {name}", height=320)  # fmt: skip
 

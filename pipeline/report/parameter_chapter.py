@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import numpy as np
 
 from pipeline.report.blocks import Block, Chapter, Table, Text, table
 from pipeline.report.material import Material
-from pipeline.report.style import number
+from pipeline.report.style import number, to_sigma
 from robcal.robot.kernel import Kernel
 from robcal.robot.model import RobotModel, parameter_unit
 from robcal.transforms import xyzrpy_from_frame
@@ -25,11 +26,11 @@ def parameter_chapter(material: Material) -> Chapter:
         if calibrated.model.terms:
             blocks.append(_terms(calibrated.model))
     if identification is not None:
-        blocks += _gauges(identification.facts)
+        blocks += _gauges(identification.facts, calibrated is not None and bool(calibrated.model.terms))
     return Chapter(
         "parameters",
         "Identified parameters",
-        "Deviations from the nominal robot, each with its standard deviation; those beyond three sigma stand out. "
+        "Deviations from the nominal robot, each with its standard deviation; those beyond three sigma are marked. "
         "What the data could not tell apart was eliminated, and is named with what it is tied to.",
         tuple(blocks),
     )
@@ -46,6 +47,7 @@ def _parameters(calibrated: Any) -> Table:
     model = calibrated.model
     kernel = Kernel(model, calibrated.statics)
     sigma = np.sqrt(np.clip(np.diag(calibrated.covariance), 0, None))
+    terms = {t.name for t in model.terms}
     rows = []
     for name, s in zip(calibrated.names, sigma, strict=True):
         if name.startswith(("base.", "tool.")):
@@ -54,13 +56,13 @@ def _parameters(calibrated: Any) -> Table:
         value, unit = in_units(model, name, theta)
         spread, _ = in_units(model, name, float(s))
         ratio = abs(theta) / s if s > 0 else float("inf")
-        rows.append([name, number(value, 4), number(spread, 2), unit, f"{ratio:.1f}" if np.isfinite(ratio) else "–",
-                     "●" if ratio > 3 else ""])  # fmt: skip
+        unit = "SI" if not unit and name.split(".")[0] in terms else unit
+        rows.append([name, to_sigma(value, spread), number(spread, 2), unit,
+                     f"{ratio:.1f}" if np.isfinite(ratio) else "–", "●" if ratio > 3 else ""])  # fmt: skip
     return table(
         ["Parameter", "Value", "Sigma", "Unit", "Value / sigma", "Significant"], rows,
         "Elastic parameters in degrees per kN m of static moment. "
-        "Base and tool are given as frames below, their deviations are folded in.", text=(0, 3, 5), emphasis=(1,),
-        shown=80,
+        "Base and tool are given as frames below, their deviations are folded in.", text=(0, 3, 5), shown=80,
     )  # fmt: skip
 
 
@@ -77,7 +79,7 @@ def _placements(model: RobotModel) -> Table:
 
 def _terms(model: RobotModel) -> Table:
     rows = [
-        [t.name, t.cause or "", f"{t.frame} {t.kind}", t.expression,
+        [t.name, t.cause or "", f"{t.frame} {t.kind}", _readable(t.expression),
          ", ".join(f"{k} = {number(v, 4)}" for k, v in t.parameters.items())]
         for t in model.terms
     ]  # fmt: skip
@@ -85,7 +87,12 @@ def _terms(model: RobotModel) -> Table:
                  "Physics that the diagnosis added to the model.", text=(0, 1, 2, 3, 4))  # fmt: skip
 
 
-def _gauges(facts: Any) -> list[Block]:
+def _readable(expression: str) -> str:
+    """An expression with its constants to four figures; the file keeps all of them."""
+    return re.sub(r"\d+\.\d{4,}(?:e[-+]?\d+)?", lambda found: f"{float(found[0]):.4g}", expression)
+
+
+def _gauges(facts: Any, diagnosed: bool) -> list[Block]:
     blocks: list[Block] = []
     eliminated = facts["eliminated"]
     rows = []
@@ -98,7 +105,7 @@ def _gauges(facts: Any) -> list[Block]:
         f"ones {number(facts['condition_raw'])}), redundancy {facts['redundancy']}, sigma0 {number(facts['sigma0'])} "
         f"(one where residuals agree with the stated covariance; p = {number(facts['p_value'], 2)})."
     )
-    blocks.append(Text(sentence))
+    blocks.append(Text(f"Before the diagnosis added its terms: {sentence}" if diagnosed else sentence))
     if rows:
         blocks.append(
             table(["Eliminated", "Why", "Tied to (does the same as)"], rows,

@@ -47,7 +47,7 @@ def robot_figure(material: Material, causes: list[dict[str, Any]]) -> Figure | N
         return None
     return Figure(
         tuple(data),
-        scene(scene={"annotations": [_note(data, n) for n in dict.fromkeys(marked)]}),
+        scene(data, scene={"annotations": [_note(data, n) for n in dict.fromkeys(marked)]}),
         f"Where it acts: {', '.join(dict.fromkeys(marked))}. The robot in pose {pose}, base coordinates.",
         "The robot as a stick figure with the place marked",
         height=460,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -46,10 +46,10 @@ def layout(x: str = "", y: str = "", **more: Any) -> dict[str, Any]:
     return out
 
 
-def scene(up: Any = (0.0, 0.0, 1.0), **more: Any) -> dict[str, Any]:
+def scene(data: Iterable[Mapping[str, Any]], up: Any = (0.0, 0.0, 1.0), **more: Any) -> dict[str, Any]:
     """Layout of a plot in space, axes in metres with equal scale, seen from the side and a little from above.
 
-    `up` is the direction (3,) that is to point upwards on the screen.
+    `data` are the traces, which the view holds as a whole; `up` (3,) is the direction that points upwards.
     """
     z = np.asarray(up, dtype=float) / np.linalg.norm(up)
     helper = np.eye(3)[int(np.argmin(np.abs(z)))]
@@ -58,12 +58,16 @@ def scene(up: Any = (0.0, 0.0, 1.0), **more: Any) -> dict[str, Any]:
     eye = 1.6 * (0.62 * side + 0.62 * np.cross(side, z)) + 0.6 * z
     xyz = ("x", "y", "z")
     axis = {"backgroundcolor": "#FFFFFF", "gridcolor": GRID, "zerolinecolor": GRID, "showspikes": False}
+    ranges = _ranges(list(data))
+    span = ranges[:, 1] - ranges[:, 0]
     view = {
-        "aspectmode": "data",
-        "xaxis": axis | {"title": {"text": "x (m)"}},
-        "yaxis": axis | {"title": {"text": "y (m)"}},
-        "zaxis": axis | {"title": {"text": "z (m)"}},
+        "aspectmode": "manual",
+        # the diagonal of the box has the same length on the screen whatever its shape, so nothing is cut off
+        "aspectratio": dict(zip(xyz, rounded(_DIAGONAL * span / np.linalg.norm(span)), strict=True)),
+        **{f"{k}axis": axis | {"title": {"text": f"{k} (m)"}, "range": ends.tolist(), "nticks": 6}
+           for k, ends in zip(xyz, ranges, strict=True)},
         "camera": {
+            "center": dict(zip(xyz, (-0.03 * z).tolist(), strict=True)),
             "eye": dict(zip(xyz, eye.tolist(), strict=True)),
             "up": dict(zip(xyz, z.tolist(), strict=True)),
         },
@@ -71,6 +75,24 @@ def scene(up: Any = (0.0, 0.0, 1.0), **more: Any) -> dict[str, Any]:
     out = layout(margin={"l": 0, "r": 0, "t": 0, "b": 0}, scene=view | more.pop("scene", {}))
     del out["xaxis"], out["yaxis"]
     return out | more
+
+
+_DIAGONAL = 1.27
+"""Length of the diagonal of a plot in space, in units of Plotly's camera."""
+
+
+def _ranges(data: list[Mapping[str, Any]]) -> np.ndarray:
+    """Ranges (3, 2) that hold all points of the traces, with a margin; a flat set gets some depth."""
+    ends = []
+    for k in "xyz":
+        values = np.array([v for trace in data for v in trace.get(k, ()) if v is not None], dtype=float)
+        ends.append((values.min(), values.max()) if len(values) else (0.0, 1.0))
+    ranges = np.array(ends)
+    span = ranges[:, 1] - ranges[:, 0]
+    least = max(0.35 * float(span.max()), 1e-3)
+    half = 0.5 * np.maximum(span * 1.1, least)
+    middle = ranges.mean(axis=1)
+    return np.stack([middle - half, middle + half], axis=1)
 
 
 def percent(share: float) -> str:
@@ -110,3 +132,11 @@ def number(value: object, digits: int = 3) -> str:
     if magnitude < -7 or magnitude > 6:
         return f"{v:.{digits - 1}e}"
     return f"{v:.{max(digits - 1 - magnitude, 0)}f}"
+
+
+def to_sigma(value: float, sigma: float) -> str:
+    """A value with as many decimals as two figures of its standard deviation have."""
+    if not (np.isfinite(value) and np.isfinite(sigma) and sigma > 0):
+        return number(value, 4)
+    decimals = 1 - int(np.floor(np.log10(sigma)))
+    return f"{value:.{min(max(decimals, 0), 9)}f}"

@@ -164,7 +164,7 @@ def _network(name: str, network: CameraNetwork) -> Figure:
         _dots(body_T_camera[:, :3, 3], list(network.image_names), "camera positions", AFTER, 2.5),
     )
     told = f"Survey of {name}: {len(network.image_names)} photographs, {len(network.ids)} targets."
-    return Figure(data, scene(), told, "Cameras and targets of the survey in space", height=480)
+    return Figure(data, scene(data), told, "Cameras and targets of the survey in space", height=480)
 
 
 def _station_scene(station: StationOrientation, material: Material) -> Figure:
@@ -184,7 +184,7 @@ def _station_scene(station: StationOrientation, material: Material) -> Figure:
     up = -stands[0][:3, 1]
     if material.calibrated is not None and material.calibrated.model.world_T_base is not None:
         up = np.asarray(material.calibrated.model.world_T_base)[:3, 2]
-    return Figure(tuple(data), scene(up), "The station: cameras, and the body's place in every pose.",
+    return Figure(tuple(data), scene(data, up), "The station: cameras, and the body's place in every pose.",
                   "Station cameras and measured poses in space", height=520)  # fmt: skip
 
 
@@ -199,5 +199,5 @@ def _poses_scene(frames: Array, names: list[str]) -> Figure:
             for i in range(3)
         )
         data.append(_lines(line, f"{'xyz'[k]} axis", colour, 3))
-    return Figure(tuple(data), scene(), "The body's measured poses in the measuring system.",
+    return Figure(tuple(data), scene(data), "The body's measured poses in the measuring system.",
                   "Measured poses in space", height=480)  # fmt: skip

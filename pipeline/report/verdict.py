@@ -141,7 +141,18 @@ def _measuring(material: Material) -> Verdict:
             reasons.append(f"redundancy {n.redundancy_total}; no check length tests the scale of {name}")
     station = material.station
     if station is not None:
-        parts.append(f"{len(station.names)} cameras are oriented from {len(station.poses)} poses")
+        oriented = f"{len(station.names)} cameras are oriented from {len(station.poses)} poses"
+        frames = material.frames
+        if frames is not None and len(frames.pose):
+            own = np.sqrt(np.median(np.trace(frames.covariance[:, :3, :3], axis1=1, axis2=2)) / 3) * 1e3
+            oriented += f" and measure the body's place to {number(own)} mm"
+            count = f"median of {len(frames.pose)} poses"
+            keys.append(KeyFigure(number(own), "mm", "Sigma of a measured place", count))
+            deviation = np.abs(frames.pairs.deviation) * 1e3
+            if len(deviation):
+                keys.append(KeyFigure(number(deviation.mean()), "mm", "Deviation of lengths between targets",
+                                      f"largest {number(deviation.max())} mm of {len(deviation)}"))  # fmt: skip
+        parts.append(oriented)
         keys.append(KeyFigure(number(station.rms_px), "px", "Residuals of the station", "RMS"))
         reasons.append(f"redundancy {station.redundancy_total:.0f} of the station, sigma0 {number(station.sigma0)}")
         if not station.converged:
@@ -155,6 +166,7 @@ def _measuring(material: Material) -> Verdict:
     word = {"good": "Good", "care": "Usable, with care", "bad": "Not usable"}.get(grade, "")
     return Verdict(
         grade, word, _sentence(parts), _sentence(reasons),
-        "bodies/*.yaml (surveyed coordinates with sigmas) and cameras/*.yaml (calibrated cameras).",
+        ("bodies/*.yaml (surveyed coordinates with sigmas) and " if material.surveys else "")
+        + "cameras/*.yaml (calibrated cameras).",
         told_diagnosis(material), tuple(keys),
     )  # fmt: skip

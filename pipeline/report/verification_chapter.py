@@ -15,7 +15,9 @@ from robcal.transforms import Array, skew
 
 
 def noise_by_tool(material: Material) -> dict[str, float]:
-    """Root mean square error (m) that the measurement alone would show, by test vector; empty without frames.
+    """Root mean square error (m) that the scatter of the measurement alone would show, by test vector.
+
+    Empty without frames. What all poses share (place of the station, coordinates of the body) is no scatter.
 
     A point t of the tool is displaced by rho + omega x t (right perturbation); turning it into the world does not
     change its length.
@@ -24,9 +26,12 @@ def noise_by_tool(material: Material) -> dict[str, float]:
     if found is None or material.identification is None:
         return {}
     rows = found[1]
+    recording = material.identification.recording
+    # frames of the own station carry their own noise alone among the detailed observations
+    alone = any(isinstance(o, FrameObservations) for o in recording.detailed)
     covariance = [
         o.covariance[np.isin(o.pose, rows)]
-        for o in material.identification.recording.observations
+        for o in (recording.detailed if alone else recording.observations)
         if isinstance(o, FrameObservations)
     ]
     if not covariance or not len(C := np.concatenate(covariance)):
@@ -205,4 +210,6 @@ def _honesty(v: Verification) -> str:
             f"{inside}; the errors are larger than predicted (p = {probability(v.p_value)}): some error is left that "
             "neither model nor noise explains, so take the stated sigmas as too small."
         )
+    if v.p_value > 0.999:
+        return f"{inside}; the errors are smaller than predicted: the stated sigmas are cautious."
     return f"{inside}; errors and predictions agree (p = {probability(v.p_value)})."

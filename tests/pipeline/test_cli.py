@@ -115,6 +115,11 @@ def test_run_predict_compensate_and_export(frame_campaign: Path, tmp_path: Path)
     assert told.exit_code == 0, told.output
     assert json.loads(told.stdout)["remaining_max_mm"] < 1e-4
     assert commands.read_text().startswith("pose,q1_deg,q2_deg")
+    program = [*arguments[:5], str(tmp_path / "part.mod"), "--skip-unreachable", "--program", "rapid", "--as", "frames"]
+    told = runner.invoke(app, program)
+    assert told.exit_code == 0, told.output
+    assert "not in the robot's base" in told.stderr
+    assert "tool_robcal" in told.stderr
     told = runner.invoke(app, ["export", str(out), "--c", str(tmp_path / "c"), "--urdf", str(tmp_path / "r.urdf")])
     assert told.exit_code == 0, told.output
     assert (tmp_path / "r.urdf").is_file()
