@@ -322,6 +322,12 @@ def _finding(
     factor = look.result.variance_factor
     covariance = _covariance(look, item, chosen.tied) * factor
     told, sigma = numeric_sigma(family.report, item.values, item.constants, covariance)
+    final = chosen.last.fit
+    for name, (parameter, unit) in family.beside.items():
+        if parameter in final.free:
+            k = final.free.index(parameter)
+            told = {name: final.model.parameters[parameter] * unit} | told
+            sigma = {name: float(np.sqrt(final.covariance[k, k] * factor)) * unit} | sigma
     excess = float(look.residual @ look.residual) - factor * look.result.redundancy
     explained = float(np.clip(projected @ look.residual / max(excess, 1e-300), 0.0, 1.0))
     carry = poses_that_carry(projected, look.fit.row_pose, chosen.recording.names)

@@ -3,7 +3,7 @@
 All quantities are whitened. With `Q` an orthonormal basis of the fitted Jacobian, a candidate with columns `C` (scaled
 by the prior amplitudes) is seen through `C - Q Q' C = U S V'`; its test statistic is `|U' r|^2` (an F test with the
 estimated variance factor), its evidence against "nothing is missing" is the Bayes factor of a linear Gaussian model
-whose amplitudes have the prior as standard deviation, averaged over five sizes of prior. Source: Kass and Raftery
+whose amplitudes have the prior as standard deviation, averaged over six sizes of prior. Source: Kass and Raftery
 (1995) for Bayes factors; Baarda (1968), Teunissen (2006) for detection, identification, adaptation.
 """
 
@@ -17,7 +17,7 @@ from scipy import special, stats
 
 from robcal.physics.family import Array
 
-PRIOR_SCALES = (0.1, 0.3, 1.0, 3.0, 10.0)
+PRIOR_SCALES = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0)
 """Sizes of the prior amplitude over which the evidence is averaged."""
 LEAST_SIGNAL = 0.05
 """Directions whose signal stays below this many sigma at the typical amplitude cannot be seen and are left out."""

@@ -75,6 +75,8 @@ class Family:
     weight : prior weight of the whole family (a cause that may act at many places shares one weight among them).
     bases : robot families: constants to the expressions.
     frees : robot families: parameters the kernel has already, which the cause sets free (order of `parameters`).
+    beside : parameters of the kernel that are fitted anyway and told with the cause: reported name to kernel name and
+        factor to the reported unit.
     displace : observation families: (data, constants) to displacements (m, k, parameters), see `ObservationData`.
     """
 
@@ -93,6 +95,7 @@ class Family:
     weight: float = 1.0
     bases: Callable[[Constants], tuple[Basis, ...]] | None = None
     frees: tuple[str, ...] = ()
+    beside: Mapping[str, tuple[str, float]] = field(default_factory=dict)
     displace: Callable[[ObservationData, Constants], Array] | None = None
     covariates: tuple[str, ...] = ()
     default_prior: float = 1.5e-4

@@ -62,8 +62,8 @@ def _stiffness(site: RobotSite, joint: Joint) -> Iterator[Family]:
     linear = Basis(joint.frame, "q", torque, "linear")
 
     def report(v: Array, c: Constants) -> dict[str, object]:
-        first = held if linear_fitted else held + float(v[1])
-        return {"linear_deg_per_kNm": first * PER_KNM, "cubic_deg_per_kNm3": float(v[0]) * np.degrees(1.0) * 1e9}
+        told: dict[str, object] = {} if linear_fitted else {"linear_deg_per_kNm": (held + float(v[1])) * PER_KNM}
+        return told | {"cubic_deg_per_kNm3": float(v[0] * np.degrees(1.0) * 1e9)}
 
     yield Family(
         "stiffness_nonlinear",
@@ -75,6 +75,7 @@ def _stiffness(site: RobotSite, joint: Joint) -> Iterator[Family]:
         report,
         "The gear of {where} stiffens or softens with load: cubic term {cubic_deg_per_kNm3:.3g} deg/kNm^3",
         bases=(lambda c: (cubic,)) if linear_fitted else (lambda c: (cubic, linear)),
+        beside={"linear_deg_per_kNm": (elastic, PER_KNM)} if linear_fitted else {},
         covariates=(torque,),
     )
 
