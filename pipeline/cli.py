@@ -213,7 +213,7 @@ def compensate(
         for sentence in answer["warnings"]:
             messages.warn(sentence)
         if program == "rapid" and targets:
-            messages.warn(f"{out}: the tool data 'tool_robcal' must be declared in the controller: the body's frame")
+            messages.warn(f"{out}: the tool data 'tool_robcal' carry the body's frame and a load of 1 kg: put in the real one")
         if program and targets and not in_base:
             messages.warn(f"{out}: its targets are in the measuring system's coordinates, not in the robot's base; "
                           "controllers want --in base")  # fmt: skip

@@ -139,7 +139,9 @@ def _program(model: RobotModel, values: Array, dialect: str, as_frames: bool, ou
     """Text of a controller's program, named after its file."""
     word = re.sub(r"\W", "_", out.stem)[:24]
     name = word if re.match(r"[A-Za-z]", word) else f"robcal_{word}"[:24]
-    return frame_program(values, dialect, name) if as_frames else joint_program(model, values, dialect, name)
+    if as_frames:
+        return frame_program(values, dialect, name, model.flange_T_tool)
+    return joint_program(model, values, dialect, name)
 
 
 def _nearest_recorded(calibrated: Calibrated, kernel: Kernel, wanted: Array, in_base: bool) -> Array:

@@ -54,7 +54,7 @@ def work(context: Context) -> Outcome:
     final = with_model(identification.robot(), calibrated)
     inputs = recorded_inputs(final.kernel, poses)
     kept_out = np.array([i for i in recording.poses if poses.verify[i]], dtype=np.int64)
-    notes = ["measured positions are verified without what the diagnosis found in the measuring system"] * taken_back
+    notes = ["verified without the errors of the measuring system that all poses share"] * taken_back
     kept_out, said = well_measured(recording, kept_out, poses.names)
     notes += said
     if len(kept_out):

@@ -37,12 +37,13 @@ def survey_findings(network: CameraNetwork, start: Camera | None, name: str) -> 
     """Lens groups that the given camera file has at zero and the self-calibration finds significant.
 
     Wald test on the adjusted numbers; "before" is the root mean square that the images would have without the group,
-    everything else adjusted anew to first order.
+    everything else adjusted anew to first order; both as errors of marks that are predicted without themselves.
     """
     if start is None:
         return ()
     found = []
-    rms, marks = network.rms_px, len(network.marks)
+    marks = len(network.marks)
+    rms, alone = network.rms_px, _predicted(marks, network.redundancy_total)
     for cause, group in LENS_GROUPS.items():
         if cause == "lens_affinity":
             given, contrast = start.fy - start.fx, _difference()
@@ -69,10 +70,26 @@ def survey_findings(network: CameraNetwork, start: Camera | None, name: str) -> 
         found.append(
             (
                 statistic,
-                ImageFinding(cause, "camera", name, None, dict(told), dict(sigma), p_value, (), (before, rms), text),
+                ImageFinding(
+                    cause,
+                    "camera",
+                    name,
+                    None,
+                    dict(told),
+                    dict(sigma),
+                    p_value,
+                    (),
+                    (alone * before, alone * rms),
+                    text,
+                ),
             )
         )
     return tuple(finding for _, finding in sorted(found, key=lambda item: -item[0]))
+
+
+def _predicted(marks: int, redundancy: float) -> float:
+    """Factor from residuals to errors of marks predicted without themselves: one by the mean redundancy number."""
+    return 2 * marks / redundancy if redundancy > 0 else float("nan")
 
 
 def _difference() -> Array:
@@ -96,7 +113,8 @@ def station_findings(
     inflation : cause -> factor by which such scores scatter where nothing is wrong (errors common to an image).
     explained : targets whose place is explained already.
     """
-    rms, marks = orientation.rms_px, len(orientation.marks)
+    marks = len(orientation.marks)
+    rms, alone = orientation.rms_px, _predicted(marks, orientation.redundancy_total)
     for item in sorted(_with_swaps(orientation.evidence, given), key=lambda e: -e.statistic):
         told, sigma, stage, text = _told(orientation, item, pose_names)
         if told is None:
@@ -111,7 +129,9 @@ def station_findings(
             other = next(name for name in orientation.names if name != item.where)
             rivals = (("camera_moved", other),)
         where = item.where.split(",")[0]
-        yield ImageFinding(item.kind, stage, where, None, told, sigma, p_value, rivals, (before, rms), text)
+        yield ImageFinding(
+            item.kind, stage, where, None, told, sigma, p_value, rivals, (alone * before, alone * rms), text
+        )
 
 
 def beyond_lenses(findings: Sequence[ImageFinding], cameras: Mapping[str, Camera]) -> tuple[ImageFinding, ...]:

@@ -44,10 +44,14 @@ def joint_program(model: RobotModel, q: ArrayLike, dialect: str, name: str = "ro
     return _program(_pick(lines, dialect)(chain, values, rotary, external), dialect, name)
 
 
-def frame_program(frames: ArrayLike, dialect: str, name: str = "robcal_targets") -> str:
+def frame_program(
+    frames: ArrayLike, dialect: str, name: str = "robcal_targets", flange_T_tool: Array | None = None
+) -> str:
     """Program that drives to corrected Cartesian targets (n, 4, 4) in base coordinates (``Compensation.F_star``).
 
-    The controller's tool and base must be those of the calibration; the configuration is the current one's.
+    The controller's tool and base must be those of the calibration; the configuration is the current one's. RAPID
+    modules declare the tool ``flange_T_tool`` (4, 4), identity if not given, with a load of 1 kg to be replaced by the
+    real one.
 
     Raises
     ------
@@ -55,7 +59,12 @@ def frame_program(frames: ArrayLike, dialect: str, name: str = "robcal_targets")
     """
     T = check_frames(frames)
     lines = {"krl": _krl_frames, "rapid": _rapid_frames, "urscript": _urscript_frames}
-    return _program(_pick(lines, dialect)(T), dialect, name)
+    declared = ""
+    if dialect == "rapid":
+        F = np.eye(4) if flange_T_tool is None else check_frames(np.asarray(flange_T_tool)[None])[0]
+        place = f"[{','.join(_numbers(1e3 * F[:3, 3], 4))}],[{','.join(_numbers(quaternion(F[:3, :3]), 9))}]"
+        declared = f"  PERS tooldata tool_robcal := [TRUE,[{place}],[1,[0,0,1],[1,0,0,0],0,0,0]];\n"
+    return _program(_pick(lines, dialect)(T), dialect, name, declared)
 
 
 def quaternion(R: Array) -> Array:
@@ -124,12 +133,13 @@ def _urscript_frames(T: Array) -> list[str]:
     return [f"movej(p[{', '.join(_numbers(row, 9))}], a=0.5, v=0.3)" for row in six]
 
 
-def _program(lines: list[str], dialect: str, name: str) -> str:
+def _program(lines: list[str], dialect: str, name: str, declared: str = "") -> str:
     if not re.fullmatch(r"[A-Za-z]\w{0,23}", name):
         raise InvalidInput(f"'{name}' is no program name: a letter, then up to 23 letters, digits or underscores")
     head, foot = {
         "krl": (f"DEF {name}()\nBAS(#INITMOV, 0)", "END"),
-        "rapid": (f"MODULE {name}\n  PROC main()", "  ENDPROC\nENDMODULE"),
+        # without monitoring, the configuration nearest to the present one is taken
+        "rapid": (f"MODULE {name}\n{declared}  PROC main()\n    ConfJ \\Off;", "  ENDPROC\nENDMODULE"),
         "urscript": (f"def {name}():", "end"),
     }[dialect]
     indent = {"krl": "", "rapid": "    ", "urscript": "  "}[dialect]

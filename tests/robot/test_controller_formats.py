@@ -52,6 +52,14 @@ def test_frames_mean_the_same_in_every_dialect():
         assert turned + np.array([x, y, z]) / 1e3 == pytest.approx((target @ [*p, 1.0])[:3], abs=1e-6)
 
 
+def test_rapid_modules_declare_their_tool():
+    program = frame_program(T, "rapid", flange_T_tool=frame(exp_so3([0.0, 0.0, np.pi / 2]), [0.1, -0.02, 0.3]))
+    (line,) = [text for text in program.splitlines() if "tooldata" in text]
+    assert line.strip().startswith("PERS tooldata tool_robcal := [TRUE,[[100.0000,-20.0000,300.0000],[0.707106781,0.0")
+    assert line.count("[") == line.count("]")
+    assert program.index("tooldata") < program.index("PROC main()") < program.index("ConfJ")
+
+
 def test_quaternion_at_the_ends():
     assert quaternion(np.eye(3)) == pytest.approx([1, 0, 0, 0])
     assert np.abs(quaternion(exp_so3([0, 0, np.pi]))) == pytest.approx([0, 0, 0, 1], abs=1e-12)
