@@ -213,7 +213,7 @@ def compensate(
         for sentence in answer["warnings"]:
             messages.warn(sentence)
         if program == "rapid" and targets:
-            messages.warn(f"{out}: the tool data 'tool_robcal' carry the body's frame and a load of 1 kg: put in the real one")
+            messages.warn(f"{out}: the tool data 'tool_robcal' hold the body's frame and 1 kg: put in the load")
         if program and targets and not in_base:
             messages.warn(f"{out}: its targets are in the measuring system's coordinates, not in the robot's base; "
                           "controllers want --in base")  # fmt: skip

@@ -83,7 +83,7 @@ def test_extended_model_predicts_better_where_nobody_measured(tmp_path: Path) ->
 
 
 def test_what_is_fitted_anyway_is_told_as_fitted_last(tmp_path: Path) -> None:
-    diagnosis, truth = run(tmp_path, 8033, "stiffness_nonlinear", snr=20.0)
+    diagnosis, _ = run(tmp_path, 8033, "stiffness_nonlinear", snr=20.0)
     found = next(f for f in diagnosis.findings if f.family.cause == "stiffness_nonlinear")
     name, unit = found.family.beside["linear_deg_per_kNm"]
     assert found.parameters["linear_deg_per_kNm"] == pytest.approx(diagnosis.model.parameters[name] * unit)
