@@ -24,7 +24,8 @@ def corrected(
 ) -> RobotRecording | None:
     """The recording without the displacements found in the measuring system; None where there are none.
 
-    `shared` (m, 6): what the own station's errors, common to all poses, displace its frames (the first observations).
+    `shared` (m, 6): what the own station's errors, common to all poses, displace its frames (the first observations);
+    freed of them, the frames have their own noise alone.
 
     Weakness: displaced targets of a body and exchanged ids are not taken back from frames.
     """
@@ -34,10 +35,12 @@ def corrected(
     kernel = Kernel(diagnosis.model, "converged")
 
     own = recording.observations[0].pose
+    noise = recording.detailed[0]
 
     def free(o: RobotObservations) -> RobotObservations:
         if shared is not None and isinstance(o, FrameObservations) and np.array_equal(o.pose, own):
-            o = dataclasses.replace(o, world_T_tool=retract(o.world_T_tool, -shared))
+            alone = noise.covariance if isinstance(noise, FrameObservations) else o.covariance
+            o = dataclasses.replace(o, world_T_tool=retract(o.world_T_tool, -shared), covariance=alone)
         return displaced(o) if found else o
 
     def displaced(o: RobotObservations) -> RobotObservations:

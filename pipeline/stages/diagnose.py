@@ -33,6 +33,7 @@ from robcal.diagnosis.selection import SelectionSettings
 from robcal.photogrammetry.bodies import Body
 from robcal.photogrammetry.measured_points import MeasuredPoints
 from robcal.photogrammetry.station_network import StationOrientation
+from robcal.transforms import Array
 
 NAME = "diagnose"
 UNCORRECTED = frozenset({"refraction", "ellipse_eccentricity", "centroid_bias"})
@@ -119,6 +120,9 @@ def work(context: Context) -> Outcome:
     calibrated = dataclasses.replace(calibrated, joint_sigma=diagnosis.joint_sigma)
     final = _final(diagnosis, recording)
     shared = None if orientation is None else final.common
+    if shared is not None:
+        # beside frames that are freed of the station's errors, the robot is as uncertain as if there were none
+        outputs.append(run.save("relative", _relative_covariance(diagnosis, recording) * final.variance_factor))
     if diagnosis.findings or shared is not None:
         # a robot that was fitted beside the errors of its station is better even where nothing is missing
         calibrated = dataclasses.replace(
@@ -185,7 +189,13 @@ def _own_station(run: Run) -> StationOrientation | None:
     return found
 
 
-def _final(diagnosis: Diagnosis, recording: Recording) -> Fit:
+def _relative_covariance(diagnosis: Diagnosis, recording: Recording) -> Array:
+    """Covariance (p, p) of the free parameters where errors common to all poses are known, variance factor one."""
+    known = _final(diagnosis, dataclasses.replace(recording, common=None), iterations=0)
+    return known.covariance[: len(diagnosis.free), : len(diagnosis.free)]
+
+
+def _final(diagnosis: Diagnosis, recording: Recording, iterations: int = 8) -> Fit:
     """The extended model at the recording: its terms are in the model, observation causes beside it."""
     direct = [
         Accepted(f.family, f.constants, f.values, f.covariance)
@@ -193,7 +203,7 @@ def _final(diagnosis: Diagnosis, recording: Recording) -> Fit:
         if f.family.displace is not None
     ]
     clean = recording.subset(~np.isin(np.array(recording.names), diagnosis.blunders))
-    return fit(diagnosis.model, clean, diagnosis.free, direct)
+    return fit(diagnosis.model, clean, diagnosis.free, direct, iterations=iterations)
 
 
 def _columns(rows: Any) -> dict[str, list[object]]:

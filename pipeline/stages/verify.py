@@ -17,7 +17,7 @@ from pipeline.stages.base import Context, Outcome, Stage, no_files
 from pipeline.stages.identify import load_identification, options_of, require_robot
 from pipeline.stages.observations import RobotObservations, RobotRecording, Rows
 from pipeline.tables import write_table
-from robcal.calibration.identification import IdentifiedRobot
+from robcal.calibration.identification import IdentifiedRobot, predict_frames
 from robcal.calibration.observations import (
     DistanceObservations,
     FrameObservations,
@@ -51,7 +51,10 @@ def work(context: Context) -> Outcome:
     taken_back = run.record("diagnose") is not None and run.has("corrected")
     recording: RobotRecording = run.load("corrected") if taken_back else identification.recording
     calibrated = load_calibrated(run)
-    final = with_model(identification.robot(), calibrated)
+    beside = calibrated
+    if taken_back and run.has("relative"):
+        beside = replace(calibrated, covariance=run.load("relative"))
+    final = with_model(identification.robot(), beside)
     inputs = recorded_inputs(final.kernel, poses)
     kept_out = np.array([i for i in recording.poses if poses.verify[i]], dtype=np.int64)
     notes = ["verified without the errors of the measuring system that all poses share"] * taken_back
@@ -60,6 +63,10 @@ def work(context: Context) -> Outcome:
     if len(kept_out):
         nominal = fit_nominal(robot, inputs.subset(rows), recording.select(rows))
         outcome = verify(final, inputs.subset(kept_out), recording.select(kept_out), nominal)
+        if beside is not calibrated:
+            # in the world, the robot is as uncertain as the station as well
+            _, C = predict_frames(with_model(identification.robot(), calibrated), inputs.subset(kept_out))
+            outcome = replace(outcome, predicted=np.sqrt(np.trace(C[:, :3, :3], axis1=1, axis2=2) / 3.0))
         tested = kept_out
     else:
         groups = repetitions(poses.q[rows])
