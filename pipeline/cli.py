@@ -171,7 +171,10 @@ def predict(
         from pipeline.prediction import predict_run
 
         answer.update(predict_run(run_folder, poses, out, nominal=nominal))
-        Messages(quiet).info(f"{answer['poses']} frames in {out}")
+        messages = Messages(quiet)
+        for sentence in answer["warnings"]:
+            messages.warn(sentence)
+        messages.info(f"{answer['poses']} frames in {out}")
 
 
 @app.command(short_help="Commands that bring the tool where it should be.")

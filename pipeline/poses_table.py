@@ -82,7 +82,7 @@ def read_poses(
 ) -> Poses:
     """Read poses.csv; without a robot only the column ``pose`` counts.
 
-    ``to_predict``: the contract's defaults for poses to predict: approach 0 (never inferred), limits not checked.
+    ``to_predict``: the contract's defaults for poses to predict: approach 0 (never inferred).
 
     Raises
     ------
@@ -116,7 +116,7 @@ def read_poses(
         approach_inferred=inferred,
         covariates=_covariates(table, known, notes),
         notes=tuple(notes),
-        outside="" if to_predict else _outside(table, robot, q),
+        outside=_outside(table, robot, q),
     )
 
 

@@ -38,7 +38,8 @@ def predict_run(folder: Path, poses: Path, out: Path, *, nominal: bool = False) 
     if covariance is not None:
         columns.update(sigma_columns(T, covariance))
     write_table(out, columns)
-    return {"poses": len(wanted), "out": str(out), "nominal": nominal}
+    warnings = [f"predicted all the same: {wanted.outside}"] if wanted.outside else []
+    return {"poses": len(wanted), "out": str(out), "nominal": nominal, "warnings": warnings}
 
 
 @dataclass(frozen=True)

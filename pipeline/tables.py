@@ -57,7 +57,7 @@ class Table:
         """Raise InvalidInput if a column is missing."""
         for name in names:
             if name not in self.columns:
-                have = list(self.columns)
+                have = [column for column in self.columns if column not in names]
                 needed = ", ".join(names)
                 raise InvalidInput(
                     f"{self.path}, row 1: column '{name}' is missing{proposal(name, have)}: needed are {needed}"

@@ -53,7 +53,7 @@ def write_rows(path: Path, header: list[str], rows: list[list[object]]) -> None:
 
 
 def test_defaults_of_poses_to_predict(finished: tuple[Path, Path], tmp_path: Path) -> None:
-    """Only pose and joint angles: no payload, approach 0; limits are not checked."""
+    """Only pose and joint angles: no payload, approach 0."""
     _, run = finished
     header = ["pose", *(f"q{k}_deg" for k in range(1, 7))]
     write_rows(tmp_path / "p.csv", header, [["a", 0, 10, 20, 30, 40, 50], ["b", 0, 10, 20, 30, 40, 50]])
@@ -99,3 +99,14 @@ def test_an_unreachable_frame_is_named_with_its_reason(finished: tuple[Path, Pat
     write_rows(tmp_path / "w.csv", [*header, "payload"], [["far", 900, 0, 0, 0, 0, 0, "sack"]])
     with pytest.raises(InvalidInput, match="row 2: payload 'sack' is not known"):
         compensate_run(run, tmp_path / "w.csv", tmp_path / "q.csv")
+
+
+def test_poses_beyond_the_ranges_are_predicted_with_a_warning(finished: tuple[Path, Path], tmp_path: Path) -> None:
+    _, run = finished
+    header = ["pose", *(f"q{k}_deg" for k in range(1, 7))]
+    write_rows(tmp_path / "p.csv", header, [["a", 0, 10, 20, 30, 40, 50], ["b", 900, 10, 20, 30, 40, 50]])
+    told = predict_run(run, tmp_path / "p.csv", tmp_path / "o.csv")
+    (warning,) = told["warnings"]
+    assert "p.csv, row 3" in warning
+    assert "q1_deg = 900 deg lies outside" in warning
+    assert predict_run(run, tmp_path / "p.csv", tmp_path / "n.csv", nominal=True)["poses"] == 2
