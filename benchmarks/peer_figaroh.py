@@ -1,4 +1,4 @@
-"""FIGAROH (PyPI ``figaroh``, on pinocchio) as a peer: the same chain as URDF, the same measured frames as CSV.
+"""FIGAROH (package ``figaroh``, on pinocchio) as a peer: the same chain as URDF, the same measured frames as CSV.
 
 Used through its own classes and defaults (choice of parameters, closed-form start of base and tool,
 Levenberg-Marquardt); only the weights of lengths and angles are told, as its cost function asks for. Its joint
