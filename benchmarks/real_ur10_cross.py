@@ -25,7 +25,7 @@ from robcal.calibration.observations import FrameObservations
 from robcal.calibration.verification import fit_nominal
 from robcal.diagnosis.curves import likenesses
 from robcal.diagnosis.empirical import CURVE_PRIOR, periodic_curve
-from robcal.diagnosis.recording import Accepted
+from robcal.diagnosis.fitting import Accepted
 from robcal.physics.site import Joint
 from robcal.robot.kernel import Kernel
 from robcal.robot.model import RobotModel

@@ -21,12 +21,18 @@ from pipeline.stages.observations import RobotRecording, frame_observations
 from robcal.calibration.identification import identify
 from robcal.diagnosis.image_data import ImageData
 from robcal.diagnosis.image_diagnosis import diagnose_images
-from robcal.diagnosis.next_poses import poses_table
+from robcal.diagnosis.next_poses import poses_table, row_of
 from robcal.diagnosis.recording import Recording
 from robcal.errors import RobcalError
 from robcal.photogrammetry.measure_frames import measure_frames
 from robcal.photogrammetry.measure_points import measure_points
-from robcal.photogrammetry.station_network import Evidence, StationMarks, StationOrientation, StationSettings
+from robcal.photogrammetry.station_network import (
+    Evidence,
+    StationMarks,
+    StationOrientation,
+    StationSettings,
+    movement,
+)
 from robcal.robot.kernel import Kernel
 from robcal.robot.model import RobotModel
 
@@ -103,11 +109,7 @@ def moved_evidence(orientation: StationOrientation, camera: str, pose: int) -> E
     """How a camera stands from a pose on against before, from its adjusted exterior orientations."""
     shift, covariance = orientation.movement(camera, pose)
     statistic = float(shift @ np.linalg.pinv(covariance, rcond=1e-9, hermitian=True) @ shift)
-    text = (
-        f"camera {camera} stands elsewhere from pose {pose} on, by {1e3 * np.linalg.norm(shift[:3]):.3g} mm and "
-        f"{np.degrees(np.linalg.norm(shift[3:])):.2g} deg"
-    )
-    return Evidence("camera_moved", camera, pose, shift, covariance, statistic, 6, text)
+    return Evidence("camera_moved", camera, pose, shift, covariance, statistic, 6, movement(camera, pose, shift))
 
 
 def which_moved(
@@ -184,11 +186,6 @@ def with_station_moves(
 
 def _repeated(recording: Recording, model: RobotModel) -> tuple[dict[str, float], ...]:
     """Some recorded poses as rows to drive again, spread over the recording."""
-    loads = list(model.payloads)
-    rows = []
-    for i in np.unique(np.linspace(0, len(recording.q) - 1, REPEATED).round().astype(int)):
-        row = {f"q{k + 1}": float(value) for k, value in enumerate(recording.q[i])}
-        row |= {n: float(v[i]) for n, v in recording.covariates.items() if n.startswith("approach")}
-        load = recording.payload[i]
-        rows.append(row | {"payload": -1.0 if load is None else float(loads.index(load))})
-    return tuple(rows)
+    inputs = recording.inputs(Kernel(model))
+    chosen = np.unique(np.linspace(0, len(recording.q) - 1, REPEATED).round().astype(int))
+    return tuple(row_of(inputs, model, int(i)) for i in chosen)

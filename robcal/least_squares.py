@@ -303,30 +303,34 @@ class LinearStatistics:
 
 def cofactor(J: Array) -> Array:
     """Inverse (p, p) of the normal matrix of a Jacobian (m, p) of full column rank, by QR of unit columns."""
-    if J.shape[1] == 0:
-        return np.zeros((0, 0))
-    scale = np.linalg.norm(J, axis=0)
-    R = linalg.qr(J / scale, mode="r", check_finite=False)[0][: J.shape[1]]
-    inverse = linalg.lapack.dtrtri(R)[0]
-    return np.asarray((inverse @ inverse.T) / np.outer(scale, scale))
+    return np.zeros((0, 0)) if J.shape[1] == 0 else _inverse_normal(*_triangle(J))
 
 
 def linear_statistics(J: Array) -> LinearStatistics:
     """Cofactor matrix, condition numbers and correlations of a whitened Jacobian (m, p) of full column rank."""
-    scale = np.linalg.norm(J, axis=0)
     if J.shape[1] == 0:
         empty = np.zeros((0, 0))
         return LinearStatistics(empty, 1.0, 1.0, empty, np.zeros(0))
-    R = linalg.qr(J / scale, mode="r", check_finite=False)[0][: J.shape[1]]
+    R, scale = _triangle(J)
     values = linalg.svdvals(R, check_finite=False)
-    inverse = linalg.solve_triangular(R, np.eye(len(R)), check_finite=False)
-    cofactor = (inverse @ inverse.T) / np.outer(scale, scale)
-    sigma = np.sqrt(np.diag(cofactor))
     raw = linalg.svdvals(R * scale, check_finite=False)
+    inverse = _inverse_normal(R, scale)
+    sigma = np.sqrt(np.diag(inverse))
     return LinearStatistics(
-        cofactor, float(values[0] / values[-1]), float(raw[0] / raw[-1]), cofactor / np.outer(sigma, sigma),
+        inverse, float(values[0] / values[-1]), float(raw[0] / raw[-1]), inverse / np.outer(sigma, sigma),
         raw / np.sqrt(len(J)),
     )
+
+
+def _triangle(J: Array) -> tuple[Array, Array]:
+    """Triangular factor (p, p) of a Jacobian with columns of unit length, and their lengths (p,)."""
+    scale = np.linalg.norm(J, axis=0)
+    return linalg.qr(J / scale, mode="r", check_finite=False)[0][: J.shape[1]], scale
+
+
+def _inverse_normal(R: Array, scale: Array) -> Array:
+    inverse = linalg.lapack.dtrtri(R)[0]
+    return np.asarray((inverse @ inverse.T) / np.outer(scale, scale))
 
 
 def global_test(cost: float, redundancy: int) -> tuple[float, float]:

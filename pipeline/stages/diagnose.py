@@ -26,8 +26,9 @@ from robcal.calibration.identification import IdentifiedRobot
 from robcal.calibration.observations import FrameObservations
 from robcal.diagnosis.contract import as_contract, with_images
 from robcal.diagnosis.diagnose import diagnose
+from robcal.diagnosis.fitting import Accepted, Fit, fit
 from robcal.diagnosis.image_diagnosis import ImageFinding
-from robcal.diagnosis.recording import Accepted, Fit, Recording, fit
+from robcal.diagnosis.recording import Recording
 from robcal.diagnosis.result import Diagnosis
 from robcal.diagnosis.selection import SelectionSettings
 from robcal.photogrammetry.bodies import Body
@@ -237,6 +238,18 @@ STAGE = Stage(
     inputs=no_files,
     settings=lambda campaign: campaign.entry.diagnosis.model_dump(),
     after=("survey", "orient", "identify"),
-    code=("robcal/diagnosis", "robcal/physics", "pipeline/stages/diagnose.py", "pipeline/stages/corrections.py",
-          "pipeline/stages/evidence.py", "pipeline/image_findings.py"),
+    code=(
+        "robcal/calibration",
+        "robcal/diagnosis",
+        "robcal/physics",
+        "robcal/robot",
+        "pipeline/calibrated.py",
+        "pipeline/common_errors.py",
+        "pipeline/image_findings.py",
+        "pipeline/moved_cameras.py",
+        "pipeline/stages/corrections.py",
+        "pipeline/stages/diagnose.py",
+        "pipeline/stages/evidence.py",
+        "pipeline/stages/observations.py",
+    ),
 )

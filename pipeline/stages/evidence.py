@@ -13,13 +13,14 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from robcal.diagnosis.candidates import Tangents, tangents
+from robcal.diagnosis.fitting import Accepted, Fit, fit
 from robcal.diagnosis.heldout import cross_validated, folds, position_errors
-from robcal.diagnosis.recording import Accepted, Fit, Recording, fit
+from robcal.diagnosis.recording import Recording
 from robcal.diagnosis.result import Diagnosis, Finding
 from robcal.diagnosis.swaps import find_swaps, relabelled
 from robcal.physics.family import Array, Basis, Constants
 from robcal.robot.model import RobotModel
-from robcal.robot.terms import evaluate, identifier, names_in
+from robcal.robot.terms import identifier, names_in
 
 LEAST_SHARE = 0.05
 """Poses on which the effect moves the observations by less than this share of the largest say nothing about it."""
@@ -217,7 +218,7 @@ def _freed(name: str, short: str, at: Tangents) -> Basis | None:
 def _law(group: Group, at: Tangents) -> Array:
     """Value (n,) of the laws of a group together."""
     shape = np.shape(at.variables["index"])
-    parts = [value * np.broadcast_to(evaluate(b.expression, at.variables), shape) for b, value in group]
+    parts = [value * np.broadcast_to(b.value(at.variables), shape) for b, value in group]
     return np.asarray(np.sum(parts, axis=0), dtype=float)
 
 
@@ -270,6 +271,6 @@ def _curves(group: Group, variables: Mapping[str, Array]) -> dict[str, tuple[Arr
         at = {first: x, **{name: np.full(GRID, value) for name, value in state.items()}}
         if any(name not in at for basis, _ in group for name in names_in(basis.expression)):
             return {}
-        y = np.sum([value * np.broadcast_to(evaluate(b.expression, at), x.shape) for b, value in group], axis=0)
+        y = np.sum([value * np.broadcast_to(b.value(at), x.shape) for b, value in group], axis=0)
         out[", ".join(f"{name} {value:+.0f}" for name, value in state.items()) or "fitted law"] = (x, y)
     return out

@@ -12,7 +12,6 @@ import numpy as np
 from pipeline.bodies import surveyed_or_given
 from pipeline.camera_file import CameraFile, write_camera
 from pipeline.campaign import Campaign, ImageSource
-from pipeline.dot_sizes import with_dot_sizes
 from pipeline.image_findings import DOT_SIZES, image_covariates
 from pipeline.measurement_tables import MarksTable
 from pipeline.moved_cameras import which_moved, with_small_moves
@@ -21,6 +20,7 @@ from pipeline.runs import Run
 from pipeline.stages.base import Context, Outcome, Stage
 from pipeline.stages.detect import DetectionIndex, load_detections
 from pipeline.stages.survey import located, size_of_marks
+from robcal.diagnosis.dot_sizes import with_dot_sizes
 from robcal.diagnosis.image_data import ImageData
 from robcal.diagnosis.image_diagnosis import ImageFinding
 from robcal.diagnosis.image_station import station_data
@@ -219,12 +219,14 @@ STAGE = Stage(
     ],
     after=("detect", "survey"),
     code=(
-        "robcal/photogrammetry",
+        "robcal/calibration",
         "robcal/diagnosis",
+        "robcal/photogrammetry",
+        "robcal/robot",
         "robcal/least_squares.py",
         "robcal/transforms.py",
-        "pipeline/stages/orient.py",
         "pipeline/moved_cameras.py",
-        "pipeline/dot_sizes.py",
+        "pipeline/stages/observations.py",
+        "pipeline/stages/orient.py",
     ),
 )

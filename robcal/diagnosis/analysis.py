@@ -11,8 +11,9 @@ from robcal.diagnosis.blunders import Suspect, worst_group
 from robcal.diagnosis.candidates import Tangents, entries, tangents
 from robcal.diagnosis.empirical import empirical_families
 from robcal.diagnosis.family_wise import FamilyWise, simulate, tails
+from robcal.diagnosis.fitting import Accepted, Fit
 from robcal.diagnosis.naming import Posterior, posterior
-from robcal.diagnosis.recording import Accepted, Fit, Recording
+from robcal.diagnosis.recording import Recording
 from robcal.diagnosis.scan import ScanResult, Stack, orthonormal_basis, restack, scan, stack_entries
 from robcal.physics.family import Array, Constants, Family
 from robcal.physics.library import all_families

@@ -16,8 +16,9 @@ import numpy as np
 
 from robcal.diagnosis.candidates import tangents
 from robcal.diagnosis.empirical import periodic_curve
+from robcal.diagnosis.fitting import Accepted, Fit
 from robcal.diagnosis.heldout import folds, rms
-from robcal.diagnosis.recording import Accepted, Fit, Recording
+from robcal.diagnosis.recording import Recording
 from robcal.diagnosis.scan import log_f_probability
 from robcal.physics.family import Array, Family
 from robcal.physics.site import RobotSite

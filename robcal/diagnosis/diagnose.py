@@ -10,11 +10,12 @@ import numpy as np
 
 from robcal.diagnosis.analysis import Analysis, analyse
 from robcal.diagnosis.curves import LEAST_POSES, Curves, find_curves, nested_errors
+from robcal.diagnosis.fitting import Accepted, Fit, fit, pseudo_covariance
 from robcal.diagnosis.heldout import cross_validated, folds, noise_floor, position_errors, rms
 from robcal.diagnosis.naming import rivals, signature
 from robcal.diagnosis.next_poses import separating_poses
 from robcal.diagnosis.noise import estimate_noise
-from robcal.diagnosis.recording import Accepted, Fit, Recording, fit, observation_data, pseudo_covariance
+from robcal.diagnosis.recording import Recording, observation_data
 from robcal.diagnosis.region import region_errors
 from robcal.diagnosis.result import Diagnosis, Finding, Rival
 from robcal.diagnosis.selection import (

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from robcal.calibration.observations import DistanceObservations, FrameObservations, PointObservations
-from robcal.diagnosis.recording import Accepted, Fit, Recording, observation_data, solve
+from robcal.diagnosis.fitting import Accepted, Fit, solve
+from robcal.diagnosis.recording import Recording, observation_data
 from robcal.physics.family import Array
 from robcal.transforms import invert, transform
 

@@ -11,7 +11,7 @@ from scipy import optimize, special
 
 from robcal.diagnosis.candidates import Tangents
 from robcal.diagnosis.result import Rival
-from robcal.diagnosis.scan import Entry, ScanResult, Stack, log_bayes_factor, scan, stack_entries
+from robcal.diagnosis.scan import Entry, ScanResult, Stack, log_bayes_factor, stack_entries
 from robcal.physics.family import Array, Constants, Family
 
 SAME_SIGNATURE = 0.98
@@ -168,9 +168,3 @@ def rivals(
     chosen.pop(named, None)
     found = [Rival(families[f], families[f].grid[g], float(probability[f]), float(share[f])) for f, g in chosen.items()]
     return tuple(sorted(found, key=lambda rival: -rival.probability))
-
-
-def rescan(stacks: Sequence[Stack], fitted: Array, residual: Array) -> ScanResult:
-    """Scan of projected residuals."""
-    projected = residual - fitted @ (fitted.T @ residual)
-    return scan(stacks, projected, len(residual) - fitted.shape[1])

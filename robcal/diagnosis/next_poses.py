@@ -6,7 +6,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from robcal.diagnosis.recording import Fit, Recording
+from robcal.diagnosis.fitting import Fit
+from robcal.diagnosis.recording import Recording
 from robcal.diagnosis.result import Finding
 from robcal.physics.family import Array, Constants, Family
 from robcal.robot.kernel import PoseInputs
@@ -64,7 +65,7 @@ def separating_poses(
             normals[i] = normals[i] + other[best].T @ other[best]
             rights[i] = rights[i] + other[best].T @ own_there[best]
         reached[weakest] += score[best]
-    return tuple(_row(inputs, fitted.model, i) for i in taken)
+    return tuple(row_of(inputs, fitted.model, i) for i in taken)
 
 
 class _frame_columns:
@@ -111,7 +112,8 @@ def _candidates(fitted: Fit, recording: Recording, count: int, seed: int) -> Pos
     return fitted.kernel.poses(q, payload=payload, covariates=covariates)
 
 
-def _row(inputs: PoseInputs, model: RobotModel, i: int) -> dict[str, float]:
+def row_of(inputs: PoseInputs, model: RobotModel, i: int) -> dict[str, float]:
+    """Pose i to be driven: `qK` (rad or m), `approachK`, `payload` (its number in the model, -1 for none)."""
     row: dict[str, float] = {f"q{k + 1}": float(value) for k, value in enumerate(inputs.q[i])}
     row.update({name: float(v[i]) for name, v in inputs.covariates.items() if name.startswith("approach")})
     row["payload"] = float(np.argmax(inputs.load[i])) if np.any(inputs.load[i]) else -1.0

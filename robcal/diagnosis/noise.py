@@ -9,7 +9,8 @@ import numpy as np
 
 from robcal.calibration.noise import restricted_components
 from robcal.diagnosis.decorrelation import SharedNoise
-from robcal.diagnosis.recording import Accepted, Fit, Recording, fit
+from robcal.diagnosis.fitting import Accepted, Fit, fit
+from robcal.diagnosis.recording import Recording
 from robcal.physics.family import Array
 from robcal.robot.model import RobotModel
 

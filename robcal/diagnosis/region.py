@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from robcal.diagnosis.fitting import Fit, largest_steps, solve
 from robcal.diagnosis.heldout import rms
-from robcal.diagnosis.recording import Fit, Recording, largest_steps, solve
+from robcal.diagnosis.recording import Recording
 from robcal.physics.family import Array
 
 SHARE = 0.2

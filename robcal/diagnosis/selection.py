@@ -13,8 +13,9 @@ import numpy as np
 
 from robcal.diagnosis.analysis import Analysis, accepted_from, analyse, extend
 from robcal.diagnosis.family_wise import FamilyWise
+from robcal.diagnosis.fitting import Accepted, Fit, fit
 from robcal.diagnosis.naming import refine
-from robcal.diagnosis.recording import Accepted, Fit, Recording, fit
+from robcal.diagnosis.recording import Recording
 from robcal.diagnosis.scan import orthonormal_basis
 from robcal.physics.family import Array, Constants
 from robcal.robot.model import RobotModel

@@ -9,7 +9,7 @@ import numpy as np
 from scipy import stats
 
 from robcal.photogrammetry.station_adjustment import Adjusted, global_columns, interior_offset
-from robcal.photogrammetry.station_network import GROUPS, Evidence, RejectedMark
+from robcal.photogrammetry.station_network import GROUPS, Evidence, RejectedMark, movement
 from robcal.photogrammetry.station_scan import scan_moves, scan_targets
 from robcal.photogrammetry.station_state import StationState
 
@@ -86,8 +86,7 @@ def _strongest(state: StationState, adjusted: Adjusted) -> Evidence | None:
                 continue
             estimate, covariance = scan.estimate_from[i, k], scan.covariance_from[i, k]
             text = (
-                f"camera {state.names[i]} stands elsewhere from pose {state.poses[k]} on, by "
-                f"{1e3 * np.linalg.norm(estimate[:3]):.3g} mm and {np.degrees(np.linalg.norm(estimate[3:])):.2g} deg"
+                movement(state.names[i], state.poses[k], estimate)
                 if kind == "camera_moved"
                 else f"camera {state.names[i]} contradicts the others in pose {state.poses[k]} only"
             )

@@ -93,6 +93,12 @@ class StationSettings:
             raise InvalidInput(f"intrinsics is auto, fixed or all, not {self.intrinsics!r}")
 
 
+def movement(camera: str, pose: int, shift: Array) -> str:
+    """A camera's movement (6,), translation (m) first, in words."""
+    length, turn = 1e3 * np.linalg.norm(shift[:3]), np.degrees(np.linalg.norm(shift[3:]))
+    return f"camera {camera} stands elsewhere from pose {pose} on, by {length:.3g} mm and {turn:.2g} deg"
+
+
 @dataclass(frozen=True)
 class Evidence:
     """Something in the data that contradicts the model again and again, with its test.

@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from robcal.physics.family import DEG, Array, Constants, Family, ObservationData
+from robcal.physics.refraction import refraction_families
 from robcal.physics.site import breaks
 
 STEEL_WIRE_N = 5.0
@@ -118,9 +119,7 @@ def _station(data: ObservationData) -> Iterator[Family]:
             displace=lambda d, c: _world(d, _positions(d)[:, :, None] * course(d, c["tau_h"])),
         )
     if data.kind == "points":
-        yield from (_bent_sight(data, axis) for axis in range(3))
-        yield from (_bent_from_origin(axis) for axis in range(3))
-        yield replace(_refraction(data), weight=0.25)
+        yield from refraction_families(data)
     first, every = breaks(data.variables["index"], 3)
 
     def moved(d: ObservationData, c: Constants) -> Array:
@@ -149,103 +148,6 @@ def _station(data: ObservationData) -> Iterator[Family]:
         displace=moved,
         covariates=("index",),
     )
-
-
-def _bend(arm: Array, axis: int) -> Array:
-    """Displacement (m, 3) by unit curvature, seen from where the arms (m, 3) begin: half the squared distance, across
-    the line of sight, towards the axis."""
-    out = -arm * arm[:, axis, None]
-    out[:, axis] += np.sum(arm**2, axis=1)
-    return np.asarray(0.5 * out)
-
-
-def _bent_sight(data: ObservationData, axis: int) -> Family:
-    """Light bends evenly across the line of sight: points move by curvature * distance^2 / 2 towards one axis.
-
-    The distance is from where the instrument stands, which is not known: with `w` its place from the centre `c`, the
-    bend is that seen from `c` plus terms linear in `p - c` and in `w`.
-    """
-    centre = data.p_world.mean(axis=0)
-
-    def bent(d: ObservationData, c: Constants) -> Array:
-        arm = d.p_world - centre
-        out = np.zeros((len(arm), 3, 4))
-        out[:, :, 0] = _bend(arm, axis)
-        for k in range(3):
-            out[:, axis, k + 1] -= 2.0 * arm[:, k]
-            out[:, k, k + 1] += arm[:, axis]
-        out[:, :, axis + 1] += arm
-        return out
-
-    names = ("curvature", "x", "y", "z")
-    letter = "xyz"[axis]
-
-    def report(v: Array, c: Constants) -> dict[str, object]:
-        middle = ", ".join(f"{m:.3f}" for m in centre)
-        law = (
-            f"{v[0]:.4g} (|a|^2 {letter} - a (a.{letter})) / 2 + a (w.{letter}) + w (a.{letter}) - 2 (a.w) {letter}; "
-            f"a = p - ({middle}) m, w = ({v[1]:.4g}, {v[2]:.4g}, {v[3]:.4g})"
-        )
-        return {
-            "curvature_per_km": 1e3 * float(v[0]),
-            "term": {"variables": ["x_m", "y_m", "z_m"], "kind": "formula", "formula": law},
-        }
-
-    return Family(
-        "refraction", "camera", "station", letter, names, (2e-5, 1e-4, 1e-4, 1e-4), report,
-        "The lines of sight of the station bend along {direction} (refraction), {curvature_per_km:.4f} per km",
-        displace=bent, weight=0.125,
-    )  # fmt: skip
-
-
-def _bent_from_origin(axis: int) -> Family:
-    """The same for an instrument that stands where its coordinates begin, as trackers do: one number."""
-
-    def bent(d: ObservationData, c: Constants) -> Array:
-        return _bend(d.p_world, axis)[:, :, None]
-
-    letter = "xyz"[axis]
-
-    def report(v: Array, c: Constants) -> dict[str, object]:
-        term = {
-            "variables": ["x_m", "y_m", "z_m"],
-            "kind": "formula",
-            "formula": f"d = {v[0]:.4g} (|p|^2 {letter} - p (p.{letter})) / 2",
-        }
-        return {"curvature_per_km": 1e3 * float(v[0]), "term": term}
-
-    return Family(
-        "refraction", "camera", "station", letter, ("curvature",), (2e-5,), report,
-        "The lines of sight of the station bend along {direction} (refraction), {curvature_per_km:.4f} per km",
-        displace=bent, weight=0.125,
-    )  # fmt: skip
-
-
-def _refraction(data: ObservationData) -> Family:
-    """A line of sight that bends (a temperature gradient, a window) warps space smoothly: a quadratic field.
-
-    Rigid motion and scale are left to their own causes; the field is centred on the measured volume and given per
-    metre squared. Which physics bends the rays cannot be told from points alone.
-    """
-    centre = data.p_world.mean(axis=0)
-
-    def bent(d: ObservationData, c: Constants) -> Array:
-        x, y, z = (d.p_world - centre).T
-        squares = np.stack([x * x, y * y, z * z, x * y, x * z, y * z], axis=1)
-        return np.einsum("mq,ij->miqj", squares, np.eye(3)).reshape(len(x), 3, -1)
-
-    names = tuple(f"{s}_{a}" for s in ("xx", "yy", "zz", "xy", "xz", "yz") for a in "xyz")
-
-    def report(v: Array, c: Constants) -> dict[str, object]:
-        terms = [f"{1e3 * value:.4g} mm * {name[:2]} along {name[3]}" for name, value in zip(names, v, strict=True)]
-        middle = ", ".join(f"{m:.3f}" for m in centre)
-        return {"term": {"variables": ["x_m", "y_m", "z_m"], "kind": "formula",
-                         "formula": f"about ({middle}) m: " + " + ".join(terms)}}  # fmt: skip
-
-    return Family(
-        "refraction", "camera", "station", None, names, (1e-4,) * len(names), report,
-        "The lines of sight of the station are bent (refraction): the measured space is warped", displace=bent,
-    )  # fmt: skip
 
 
 def _cross_columns(arm: Array) -> Array:

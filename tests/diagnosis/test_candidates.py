@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from robcal.diagnosis.candidates import tangents
-from robcal.diagnosis.recording import fit
+from robcal.diagnosis.fitting import fit
 from robcal.physics.library import all_families
 from robcal.physics.site import RobotSite
 from tests.diagnosis.recordings import concealed

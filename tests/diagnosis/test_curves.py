@@ -11,7 +11,8 @@ from robcal.calibration.observations import FrameObservations
 from robcal.diagnosis.curves import LEAST_POSES, curve, find_curves, likenesses, nested_errors
 from robcal.diagnosis.diagnose import diagnose
 from robcal.diagnosis.empirical import periodic_curve
-from robcal.diagnosis.recording import Accepted, Fit, Recording, fit, terms_of
+from robcal.diagnosis.fitting import Accepted, Fit, fit, terms_of
+from robcal.diagnosis.recording import Recording
 from robcal.physics.site import Joint
 from robcal.robot.kernel import Kernel
 from tests.calibration.scenarios import Scenario, scenario

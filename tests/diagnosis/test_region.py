@@ -8,7 +8,7 @@ import numpy as np
 
 from pipeline.stages.diagnose import cross_elasticities, own_elasticities
 from robcal.diagnosis.diagnose import diagnose
-from robcal.diagnosis.recording import fit
+from robcal.diagnosis.fitting import fit
 from robcal.diagnosis.region import SHARE, extrapolated, outermost, region_errors
 from tests.diagnosis.recordings import concealed
 

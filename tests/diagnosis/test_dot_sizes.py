@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.dot_sizes import with_dot_sizes
+from robcal.diagnosis.dot_sizes import with_dot_sizes
 from robcal.photogrammetry.bodies import Body
 from robcal.photogrammetry.eccentricity import centre_shift
 from tests.diagnosis.image_scenes import station
