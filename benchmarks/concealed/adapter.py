@@ -79,7 +79,7 @@ def library(folder: Path, tables: Mapping[str, Path]) -> Answer:
     from pipeline.calibrated import recorded_inputs
     from pipeline.campaign import read_campaign
     from pipeline.runs import Run
-    from pipeline.stages.diagnose import cross_elasticities, own_elasticities
+    from pipeline.stages.diagnose import optional_parameters, own_elasticities
     from pipeline.stages.identify import identify_recording, options_of, require_robot
     from pipeline.stages.observations import build_recording
     from robcal.diagnosis.contract import as_contract
@@ -123,7 +123,7 @@ def library(folder: Path, tables: Mapping[str, Path]) -> Answer:
         found.names,
         (*found.eliminated, *own_elasticities(found)),
         recording(np.flatnonzero(poses.verify)),
-        optional=cross_elasticities(found),
+        optional=optional_parameters(found),
     )
     seconds = time.process_time() - start
     return Answer(as_contract(result), _predicted(result.model, campaign, covariates, tables), seconds)

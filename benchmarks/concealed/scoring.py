@@ -20,6 +20,9 @@ NOT_COMPARED = {"pose", "order", "from", "with", "threshold_Nm", "tau_h", "covar
 NOT_COMPARED |= {"linear_deg_per_kNm"}  # drawn on top of the joint's own compliance, told as the whole
 
 
+UP_TO_A_MOTION = frozenset({"base_moved", "camera_moved", "refraction"})
+"""Effects whose recording leaves the world open: which of base and station moved, and, where the place of the
+instrument is not given, the turn that a bend of its rays resembles. Errors count after the best rigid motion."""
 VISIBLE = 3.0
 """A name for an effect outside the library is wrong if what it cannot reproduce has at least this SNR; a name that
 reproduces the effect down to the noise is as good a model as the data can tell."""
@@ -126,7 +129,8 @@ def _intervals(effect: Effect, first: Mapping[str, Any]) -> tuple[int, int]:
 
 def _gain(recording: Recording, truth: Truth, answer: Answer, design: Design) -> dict[str, Any]:
     """Errors on kept-out poses: of the fit without the effect, of the tool's prediction, of the true form's fit."""
-    best = oracle(truth, recorded_noise(recording, truth), design)
+    free_world = any(effect.cause in UP_TO_A_MOTION for effect in truth.effects)
+    best = oracle(truth, recorded_noise(recording, truth), design, free_world=free_world)
     out: dict[str, Any] = {}
     for name, kept, before, after in (
         ("inside", truth.inside, best.before_inside, best.after_inside),
@@ -135,5 +139,5 @@ def _gain(recording: Recording, truth: Truth, answer: Answer, design: Design) ->
         if name not in answer.predicted:
             continue
         out[f"before_{name}"], out[f"oracle_{name}"] = before, after
-        out[f"after_{name}"] = tip_error_mm(answer.predicted[name], kept.with_effect)
+        out[f"after_{name}"] = tip_error_mm(answer.predicted[name], kept.with_effect, free_world=free_world)
     return out

@@ -22,6 +22,7 @@ from pipeline.stages.evidence import evidence_of
 from pipeline.stages.identify import load_identification, require_robot
 from pipeline.stages.observations import RobotRecording, Rows
 from pipeline.tables import write_table
+from robcal.calibration.identifiability import weak_parameters
 from robcal.calibration.identification import IdentifiedRobot
 from robcal.calibration.observations import FrameObservations
 from robcal.diagnosis.contract import as_contract, with_images
@@ -34,6 +35,7 @@ from robcal.diagnosis.selection import SelectionSettings
 from robcal.photogrammetry.bodies import Body
 from robcal.photogrammetry.measured_points import MeasuredPoints
 from robcal.photogrammetry.station_network import StationOrientation
+from robcal.physics.usual import DEVIATION
 from robcal.transforms import Array
 
 NAME = "diagnose"
@@ -106,7 +108,7 @@ def work(context: Context) -> Outcome:
         verify,
         settings_beside(settings_of(campaign), [f for f in images.findings if f not in images.taken_back]),
         context.messages.info,
-        cross_elasticities(found),
+        optional_parameters(found),
     )
     outputs = [run.diagnosis]
     content = with_images(as_contract(diagnosis), images.findings, images.scans, images.noise)
@@ -159,12 +161,20 @@ def own_elasticities(found: IdentifiedRobot) -> tuple[str, ...]:
     return tuple(name for name in found.rejected_elasticities if name in own)
 
 
-def cross_elasticities(found: IdentifiedRobot) -> tuple[str, ...]:
-    """Elasticities across joints' axes that the identification took by evidence (standard model only)."""
+def optional_parameters(found: IdentifiedRobot) -> tuple[str, ...]:
+    """What the identification of a standard model took only because the residuals asked for it.
+
+    Elasticities across joints' axes, and geometry that is less certain than anybody would doubt it anyway: that one was
+    opened for what nothing plausible explained.
+    """
     if found.options.parameters != "standard":
         return ()
     own = {f"{joint.name}.elastic_{joint.joint_kind}" for joint in found.model.joints if not joint.prismatic}
-    return tuple(name for name in found.names if ".elastic_" in name and name not in own)
+    cross = tuple(name for name in found.names if ".elastic_" in name and name not in own)
+    frames = {frame.name for frame in found.model.frames}
+    free = [name.rsplit(".", 1)[0] in frames and ".elastic_" not in name for name in found.names]
+    limits = np.where(free, DEVIATION, np.inf)
+    return (*cross, *weak_parameters(found.names, found.covariance, limits))
 
 
 def settings_beside(settings: SelectionSettings, findings: Sequence[ImageFinding]) -> SelectionSettings:

@@ -141,6 +141,27 @@ def limits_at(limits: Array, columns: NDArray[np.intp], moments: Array) -> Array
     return out
 
 
+def weak_parameters(names: Sequence[str], covariance: Array, limits: Array) -> tuple[str, ...]:
+    """Names that may go back to nominal, the weakest first, until the data determine all others within their limits.
+
+    Parameters
+    ----------
+    names, covariance : (p,) fitted parameters and their covariance (p, p). limits : (p,) largest standard deviation.
+
+    Each one that goes is taken as known, which determines those better that were tied to it.
+    """
+    left = np.array(covariance, dtype=float)
+    gone: list[str] = []
+    while True:
+        excess = np.sqrt(np.clip(np.diag(left), 0.0, None)) / limits
+        worst = int(np.argmax(excess))
+        if not excess[worst] > 1.0:
+            return tuple(gone)
+        gone.append(names[worst])
+        left -= np.outer(left[:, worst], left[worst]) / left[worst, worst]
+        left[worst], left[:, worst] = 0.0, 0.0
+
+
 @dataclass(frozen=True)
 class StepwiseChoice:
     """Result of the choice by evidence.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -19,21 +19,19 @@ from robcal.diagnosis.recording import Recording, observation_data
 from robcal.diagnosis.region import region_errors
 from robcal.diagnosis.result import Diagnosis, Finding, Rival
 from robcal.diagnosis.selection import (
-    PLAUSIBLE_DEVIATION,
     Selection,
     SelectionSettings,
     poses_that_carry,
     select,
 )
 from robcal.diagnosis.swaps import find_swaps, relabelled
+from robcal.diagnosis.unloaded import unloaded_elasticities
 from robcal.physics.family import Array, ObservationData, numeric_sigma
 from robcal.physics.measuring import describe, swapped
+from robcal.physics.usual import usual_size
 from robcal.robot.model import RobotModel
-from robcal.robot.terms import identifier
 
 DEFAULTS = SelectionSettings()
-PLAUSIBLE_DEFLECTION = 3e-4
-"""rad under the largest load, for elasticities."""
 MOST_BESIDE_CURVES = 4
 """Causes that are looked for beside irregular curves of the joints: what these leave is small."""
 MOST_POSES = 200
@@ -67,6 +65,8 @@ def diagnose(
     exchanged = _swap_findings(model, recording, verify, free, swaps)
     recording = relabelled(recording, swaps)
     verify = None if verify is None else relabelled(verify, swaps)
+    assumed = unloaded_elasticities(model, recording, tied)
+    model = model.with_parameters(assumed)
     thin = thinned(recording)
     noise = estimate_noise(model, thin, free)
     curves, of_curves = _curves(model, recording, free, verify, tell)
@@ -131,7 +131,7 @@ def diagnose(
         unexplained_pattern=pattern,
         heldout=heldout,
         heldout_kind="verify" if verify is not None else "cross-validation",
-        model=final.model,
+        model=final.model.with_parameters({name: 0.0 for name in assumed if name not in final.free}),
         free=final.free,
         covariance=final.covariance[: len(final.free), : len(final.free)] * final.variance_factor,
         next_poses=poses,
@@ -287,23 +287,13 @@ def _covariance(look: Analysis, item: Accepted, held: Iterable[str]) -> Array:
     together = np.column_stack(columns)
     seen = together - look.basis @ (look.basis.T @ together)
     cofactor = pseudo_covariance(seen)
-    sizes = {name: plausible_size(name, look.at.variables) for name in held if name in look.at.parameters}
+    sizes = {name: usual_size(name, look.at.variables) for name in held if name in look.at.parameters}
     moved = [look.at.parameters[name] * size for name, size in sizes.items() if size > 0]
     if moved:
         pulled = cofactor @ (seen.T @ np.stack(moved, axis=1))
         cofactor = cofactor + pulled @ pulled.T / max(look.result.variance_factor, 1e-300)
     count = len(item.values)
     return cofactor[:count, :count]
-
-
-def plausible_size(name: str, variables: Mapping[str, Array]) -> float:
-    """Usual size of a deviation (m, rad), or of an elasticity by the deflection under the largest load."""
-    frame, kind = name.rsplit(".", 1)
-    if not kind.startswith("elastic_"):
-        return PLAUSIBLE_DEVIATION if kind in ("x", "y", "z", "roll", "pitch", "yaw") else 0.0
-    moment = variables.get(f"{identifier(frame)}_m{kind.removeprefix('elastic_')}")
-    largest = 0.0 if moment is None else float(np.max(np.abs(moment)))
-    return PLAUSIBLE_DEFLECTION / largest if largest > 1.0 else 0.0
 
 
 def _finding(

@@ -10,6 +10,7 @@ import numpy as np
 from robcal.diagnosis.recording import Recording, observation_data
 from robcal.diagnosis.scan import orthonormal_basis
 from robcal.physics.family import Array, Constants, Family
+from robcal.physics.usual import usual_sizes
 from robcal.robot.kernel import Kernel, PoseInputs
 from robcal.robot.kernel_cache import kernel_of
 from robcal.robot.model import RobotModel, Term
@@ -20,6 +21,8 @@ MOST_FREE = 12
 """A law with more amplitudes than these is a Gaussian process: its prior goes into the fit."""
 TERM_PARTS = 24
 """Amplitudes in one expression of the kernel, which may not grow without end."""
+LARGEST_STEP = 5.0
+"""Largest step of a parameter that makes sense, in its usual sizes."""
 MANY = 120
 """Parameters from which normal equations replace the singular values of the Jacobian."""
 
@@ -144,7 +147,7 @@ def fit(
         return frames, residual, jacobian
 
     width = len(names) + sum(len(item.names) for item in direct)
-    brake = np.diag(largest_steps(names, width))[: len(names)]
+    brake = np.diag(damping(names, width, kernel.variables(theta, inputs)))[: len(names)]
     sizes = {f"{term.name}.{short}": size for term in model.terms for short, size in term.priors.items()}
     held = np.array([k for k, name in enumerate(names) if name in sizes], dtype=np.intp)
     prior = np.zeros((len(held), width))
@@ -192,17 +195,11 @@ def fit(
     )
 
 
-def largest_steps(names: Sequence[str], columns: int) -> Array:
+def damping(names: Sequence[str], columns: int, variables: Mapping[str, Array]) -> Array:
     """Reciprocals (columns,) of the largest steps that make sense for named parameters; zero for amplitudes."""
-    return np.array([*map(_brake, names), *[0.0] * (columns - len(names))])
-
-
-def _brake(name: str) -> float:
-    """Reciprocal of the largest step that makes sense for a parameter; zero for amplitudes of causes."""
-    kind = name.rsplit(".", 1)[-1]
-    if kind.startswith("elastic_"):
-        return 1.0 / 2e-5
-    return 1.0 / 5e-3 if kind in ("x", "y", "z", "roll", "pitch", "yaw") and not name.startswith("payload.") else 0.0
+    largest = LARGEST_STEP * usual_sizes(names, variables)
+    brakes = np.where(largest > 0, 1.0 / np.where(largest > 0, largest, 1.0), 0.0)
+    return np.concatenate([brakes, np.zeros(columns - len(names))])
 
 
 def _amplitudes(

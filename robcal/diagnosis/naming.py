@@ -16,7 +16,7 @@ from robcal.physics.family import Array, Constants, Family
 
 SAME_SIGNATURE = 0.98
 """Share of the named signature that a rival must reproduce to be called indistinguishable."""
-SET_LEVEL = 0.95
+SET_LEVEL = 0.99
 
 
 @dataclass(frozen=True)
@@ -152,7 +152,7 @@ def rivals(
     projected: Array,
     eligible: Array,
 ) -> tuple[Rival, ...]:
-    """The rest of the 95 % set, and every eligible family with (nearly) the same signature and a fair evidence."""
+    """The rest of the 99 % set, and every eligible family with (nearly) the same signature and a fair evidence."""
     probability = ranked.probability(eligible)
     share, share_grid = overlap(stacks, projected, len(families))
     chosen: dict[int, int] = {}

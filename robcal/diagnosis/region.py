@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from robcal.diagnosis.fitting import Fit, largest_steps, solve
+from robcal.diagnosis.fitting import Fit, damping, solve
 from robcal.diagnosis.heldout import rms
 from robcal.diagnosis.recording import Recording
 from robcal.physics.family import Array
@@ -34,9 +34,10 @@ def extrapolated(recording: Recording, fitted: Fit, region: Array) -> float:
     """
     test = region[fitted.row_pose]
     per = len(fitted.residual) // len(recording.observations.pose)
-    damping = np.diag(largest_steps(fitted.free, fitted.jacobian.shape[1]))
-    rows = np.vstack([fitted.jacobian[~test], damping, fitted.prior])
-    step = solve(rows, np.concatenate([fitted.residual[~test], np.zeros(len(damping)), fitted.prior_residual]))
+    variables = fitted.kernel.variables(fitted.theta, fitted.inputs)
+    brakes = np.diag(damping(fitted.free, fitted.jacobian.shape[1], variables))
+    rows = np.vstack([fitted.jacobian[~test], brakes, fitted.prior])
+    step = solve(rows, np.concatenate([fitted.residual[~test], np.zeros(len(brakes)), fitted.prior_residual]))
     predicted = np.where(test, fitted.residual - fitted.jacobian @ step, 0.0)
     errors = recording.unwhiten(predicted[:, None], fitted.frames)[:, : min(per, 3), 0]
     return rms(errors[region[recording.observations.pose]])

@@ -18,13 +18,11 @@ from robcal.diagnosis.naming import refine
 from robcal.diagnosis.recording import Recording
 from robcal.diagnosis.scan import orthonormal_basis
 from robcal.physics.family import Array, Constants
+from robcal.physics.usual import usual_size
 from robcal.robot.model import RobotModel
 
-PLAUSIBLE_ELASTICITY = 3e-6
-PLAUSIBLE_DEVIATION = 1e-3
-"""rad/(N m); m or rad: deviations that robots have."""
 VISIBLE_SIGMA = 5.0
-"""Signal in sigma from which a parameter of plausible size is worth fitting."""
+"""Signal in sigma from which a parameter of usual size is worth fitting."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +32,7 @@ class SelectionSettings:
     Attributes
     ----------
     level : family-wise level of a mismatch.
+    further : share of that level which causes beside a first one must reach: each look is another chance to be wrong.
     most : causes at most.
     blunder_log_p : logarithm of the probability (all observations weighed in) below which one is a gross error.
     blunder_share : share of the observations that may be left out as gross errors.
@@ -43,6 +42,7 @@ class SelectionSettings:
     """
 
     level: float = 0.01
+    further: float = 0.3
     most: int = 8
     blunder_log_p: float = float(np.log(1e-3))
     blunder_share: float = 0.1
@@ -113,7 +113,8 @@ def select(
             present = fit(model, recording, free, accepted)
             continue
         trial = None
-        if look.p_value <= settings.level and len(accepted) < settings.most:
+        level = settings.level * (settings.further if accepted else 1.0)
+        if look.p_value <= level and len(accepted) < settings.most:
             trial = _extended(model, recording, free, look, barred, settings, tell)
         if trial is not None:
             present, accepted = trial, trial.accepted
@@ -175,7 +176,7 @@ def newly_visible(look: Analysis, tied: frozenset[str]) -> tuple[str, ...]:
         column = look.at.parameters.get(name)
         if column is None:
             continue
-        column = column * (PLAUSIBLE_ELASTICITY if ".elastic_" in name else PLAUSIBLE_DEVIATION)
+        column = column * usual_size(name, look.at.variables)
         rest = column - basis @ (basis.T @ column)
         if np.linalg.norm(rest) > VISIBLE_SIGMA:
             seen.append(name)

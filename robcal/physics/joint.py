@@ -9,8 +9,10 @@ import numpy as np
 
 from robcal.physics.family import PER_KNM, Array, Basis, Constants, Family
 from robcal.physics.site import LETTER_OF_KIND, Joint, RobotSite, breaks, exponential_law
+from robcal.physics.usual import LEAST_MOMENT
 
-TORQUE_SCALES_NM = (5.0, 15.0, 50.0, 150.0, 500.0)
+TORQUE_SCALES = (0.02, 0.06, 0.2, 0.5, 1.2)
+"""Scales of a lost motion that are tried first, in shares of the largest load torque: joints are built for theirs."""
 MOST_THRESHOLDS = 60
 TRIED_THRESHOLDS = 8
 HIGHEST_RIPPLE_ORDER = 180
@@ -38,7 +40,7 @@ def _amplitude_phase(values: Array, factor: float) -> tuple[float, float]:
 
 def _stiffness(site: RobotSite, joint: Joint) -> Iterator[Family]:
     k = joint.number
-    if joint.prismatic or not site.varies(f"torque{k}", 1.0):
+    if joint.prismatic or not site.varies(f"torque{k}", LEAST_MOMENT):
         return
     elastic = f"{joint.frame}.elastic_{joint.own_angle}"
     torque = f"torque{k}"
@@ -158,9 +160,8 @@ def _lost_motion(site: RobotSite, joint: Joint) -> Iterator[Family]:
     k = joint.number
     torque = site.variables[f"torque{k}"]
     largest = float(np.max(np.abs(torque)))
-    if joint.prismatic or not site.varies(f"torque{k}", 1.0):
+    if joint.prismatic or not site.varies(f"torque{k}", LEAST_MOMENT):
         return
-    scales = [s for s in TORQUE_SCALES_NM if 0.005 * largest < s < 1.5 * largest] or [0.3 * largest]
     yield Family(
         "lost_motion",
         "robot",
@@ -169,8 +170,8 @@ def _lost_motion(site: RobotSite, joint: Joint) -> Iterator[Family]:
         ("amplitude",),
         (2e-4,),
         lambda v, c: {"amplitude_deg": float(v[0]) * np.degrees(1.0), "torque_Nm": c["torque_Nm"]},
-        "{where} loses {amplitude_deg:.4f} deg around zero load (lost motion, scale {torque_Nm:.0f} N m)",
-        grid=tuple({"torque_Nm": s} for s in scales),
+        "{where} loses {amplitude_deg:.4f} deg around zero load (lost motion, scale {torque_Nm:.3g} N m)",
+        grid=tuple({"torque_Nm": share * largest} for share in TORQUE_SCALES),
         continuous={"torque_Nm": (0.003 * largest, 2.0 * largest)},
         positive=0.7,
         bases=lambda c: (Basis(joint.frame, "q", f"tanh(torque{k}/torque_Nm)", "amplitude", c),),

@@ -8,10 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from robcal.physics.family import DEG, Array
+from robcal.physics.usual import DEFLECTION, LEAST_MOMENT
 from robcal.robot.model import RobotModel
 
-TYPICAL_DEFLECTION = 2e-4
-"""rad under the largest load of a recording."""
 ANGLE_OF_AXIS = {"x": "roll", "y": "pitch", "z": "yaw"}
 LETTER_OF_KIND = {"roll": "x", "pitch": "y", "yaw": "z", "x": "x", "y": "y", "z": "z"}
 
@@ -95,7 +94,7 @@ class RobotSite:
         """Typical compliance (rad/(N m)) for a moment that was recorded: `least`, or more where loads are small, since
         small robots are softer in proportion."""
         largest = float(np.max(np.abs(self.variables.get(moment, np.zeros(1)))))
-        return max(least, TYPICAL_DEFLECTION / max(largest, 1.0))
+        return max(least, DEFLECTION / max(largest, LEAST_MOMENT))
 
     def duration_h(self) -> float:
         """Hours between the first and the last pose; zero without times."""

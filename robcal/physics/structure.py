@@ -9,6 +9,7 @@ import numpy as np
 
 from robcal.physics.family import DEG, PER_KNM, Array, Basis, Constants, Family, Report
 from robcal.physics.site import LETTER_OF_KIND, Joint, RobotSite, breaks, exponential_law
+from robcal.physics.usual import LEAST_MOMENT
 from robcal.robot.terms import identifier
 
 
@@ -26,7 +27,7 @@ def structure_families(site: RobotSite) -> Iterator[Family]:
 def _link_compliance(site: RobotSite, joint: Joint) -> Iterator[Family]:
     for angle in joint.cross_angles if not joint.prismatic else ("roll", "pitch", "yaw"):
         name = f"{joint.frame}.elastic_{angle}"
-        if name in site.fitted or not site.varies(f"{identifier(joint.frame)}_m{angle}", 1.0):
+        if name in site.fitted or not site.varies(f"{identifier(joint.frame)}_m{angle}", LEAST_MOMENT):
             continue
         yield Family(
             "link_compliance",
@@ -158,7 +159,7 @@ def _growth(site: RobotSite, joint: Joint) -> Iterator[Family]:
 
 
 def _base(site: RobotSite) -> Iterator[Family]:
-    if any(site.varies(f"base_m{axis}", 1.0) for axis in "xy"):
+    if any(site.varies(f"base_m{axis}", LEAST_MOMENT) for axis in "xy"):
         yield Family(
             "base_compliance",
             "robot",

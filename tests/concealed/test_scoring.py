@@ -52,6 +52,7 @@ def test_backlash_is_hysteresis_where_no_load_turns_the_joint(equal: Equivalence
 def test_moved_base_and_moved_station_are_the_same(equal: Equivalence) -> None:
     moved = Effect("base_moved", "base", None, {"index": 20, "shift_mm": (0.3, 0.1, 0.0), "turn_deg": (0.0, 0.0, 0.01)})
     assert equal.same(moved, _cause("camera_moved", "station", parameters={"pose": "p021"}))
+    assert equal.same(moved, _cause("camera_moved", "station", parameters={"pose": "p024"}))  # noise shifts the pose
     assert not equal.same(moved, _cause("zero_jump", "axis2", parameters={"pose": "p021"}))
 
 

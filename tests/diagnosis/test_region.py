@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.stages.diagnose import cross_elasticities, own_elasticities
+from pipeline.stages.diagnose import optional_parameters, own_elasticities
 from robcal.diagnosis.diagnose import diagnose
 from robcal.diagnosis.fitting import fit
 from robcal.diagnosis.region import SHARE, extrapolated, outermost, region_errors
@@ -26,7 +26,7 @@ def test_what_was_left_out_shows_outside_the_range(tmp_path: Path) -> None:
     found, identify, _, _ = concealed(tmp_path, seed=4, effects=["joint_eccentricity"], snr=25.0)
     result = diagnose(
         found.model, identify, found.names, (*found.eliminated, *own_elasticities(found)), None,
-        optional=cross_elasticities(found),
+        optional=optional_parameters(found),
     )  # fmt: skip
     assert result.mismatch
     assert result.region is not None
