@@ -25,6 +25,7 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):  # before numpy is loa
     os.environ.setdefault(_name, "1")
 
 from benchmarks.concealed.adapter import ADAPTERS, Answer  # noqa: E402
+from benchmarks.concealed.image_runs import Imaged, image_runs, run_imaged  # noqa: E402
 from benchmarks.concealed.own_runs import Own, own_runs, run_own  # noqa: E402
 from benchmarks.concealed.scenarios import BATTERIES, Scenario  # noqa: E402
 from benchmarks.concealed.scoring import score  # noqa: E402
@@ -34,16 +35,22 @@ from fixtures.campaigns import write_campaign, write_poses  # noqa: E402
 from fixtures.plan import Truth  # noqa: E402
 from fixtures.recordings import driven_further, record  # noqa: E402
 
-LEVELS = ("points", "frames", "distances", "sensor", "survey", "station", "own")
-"""Levels of measurement; surveys, stations and robots with an own station have nulls and singles only."""
+LEVELS = ("points", "frames", "distances", "sensor", "survey", "station", "own", "images")
+"""Levels of measurement; surveys, stations and robots with an own station (``own``: marks, ``images``: rendered images)
+have nulls and singles only."""
 
 
-def run_one(scenario: Scenario | Sighting | Own, adapter: str) -> dict[str, Any]:
+Run = Scenario | Sighting | Own | Imaged
+
+
+def run_one(scenario: Run, adapter: str) -> dict[str, Any]:
     """Make, run and score one campaign; a failure of the tool is a record with ``error``."""
     if isinstance(scenario, Sighting):
         return run_sighting(scenario)
     if isinstance(scenario, Own):
         return run_own(scenario)
+    if isinstance(scenario, Imaged):
+        return run_imaged(scenario)
     head = {"key": scenario.key, "battery": scenario.battery, "label": scenario.label, "level": scenario.level}
     head |= {"snr": scenario.snr, "seed": scenario.seed}
     plan = scenario.build()
@@ -87,12 +94,14 @@ def _read(path: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
 
 
-def _wanted(arguments: argparse.Namespace, done: set[str]) -> Iterator[Scenario | Sighting | Own]:
-    scenarios: Iterator[Scenario | Sighting | Own]
+def _wanted(arguments: argparse.Namespace, done: set[str]) -> Iterator[Run]:
+    scenarios: Iterator[Run]
     if arguments.level in ("survey", "station"):
         scenarios = sightings(arguments.battery, arguments.count, arguments.seed, arguments.level)
     elif arguments.level == "own":
         scenarios = own_runs(arguments.battery, arguments.count, arguments.seed)
+    elif arguments.level == "images":
+        scenarios = image_runs(arguments.battery, arguments.count, arguments.seed)
     else:
         scenarios = BATTERIES[arguments.battery](arguments.count, arguments.seed, arguments.level)
     for scenario in scenarios:
@@ -157,7 +166,7 @@ def main() -> int:
     parser.add_argument("--out", type=Path, help="file of records (JSON lines), appended to and resumed from")
     parser.add_argument("-q", "--quiet", action="store_true")
     arguments = parser.parse_args()
-    if arguments.level in ("survey", "station", "own") and arguments.battery not in ("nulls", "singles", "table"):
+    if arguments.level in LEVELS[4:] and arguments.battery not in ("nulls", "singles", "table"):
         parser.error(f"the level {arguments.level} has the batteries nulls and singles only")
     if arguments.battery == "table":
         records = [r for path in arguments.records for r in _read(path)]

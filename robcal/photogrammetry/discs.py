@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from robcal.photogrammetry.camera import Camera, project_with_jacobians
-from robcal.photogrammetry.eccentricity import body_normals
+from robcal.photogrammetry.eccentricity import shape_normals
 from robcal.transforms import Array, transform
 
 IntArray = NDArray[np.int64]
@@ -112,7 +112,8 @@ def modelled_discs(seen: Discs, stated: ArrayLike, points: ArrayLike) -> tuple[A
     Stated diameters (t,) m, 0 where unknown, hold; the others are measured by the ellipses and by how much the stated
     ones look too large. Points (t, 3) in a scale of their own, far from metres, get diameters in that scale. Where no
     diameter is stated at all none is made up: whether dots are large enough to matter is then left to the diagnosis.
-    Normals from the body's shape are replaced where it has none or the ellipses contradict it.
+    Normals from the body's shape are replaced where it has none, where they are looser than the ellipses (targets of
+    different heights), and where the ellipses contradict them.
     """
     given = np.nan_to_num(np.asarray(stated, dtype=float))
     ratio = size_ratio(seen, given)
@@ -122,11 +123,11 @@ def modelled_discs(seen: Discs, stated: ArrayLike, points: ArrayLike) -> tuple[A
     diameters = given if metric else given * ratio
     measured = np.nan_to_num(seen.diameter / ratio if metric else seen.diameter)
     diameters = np.where(given > 0, diameters, measured)
-    normals = body_normals(points)
+    normals, loose = shape_normals(points)
     cosine = np.abs(np.einsum("ti,ti->t", normals, seen.normal))
     known = np.isfinite(seen.sigma) & (seen.sigma < _FLAT)
     apart = np.arccos(np.clip(np.nan_to_num(cosine, nan=-1.0), 0.0, 1.0)) > np.maximum(_FLAT, 5.0 * seen.sigma)
-    better = known & (apart | ~np.isfinite(normals).all(axis=1))
+    better = known & (apart | (seen.sigma < loose) | ~np.isfinite(normals).all(axis=1))
     if not better.any():
         return diameters, None
     return diameters, np.where(better[:, None], seen.normal, normals)

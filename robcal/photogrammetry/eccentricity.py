@@ -76,7 +76,15 @@ def _ideal_jacobian(camera: Camera, ideal: Array) -> Array:
 
 
 def body_normals(points: ArrayLike, neighbours: int = 6) -> Array:
-    """Unit normals (t, 3) of targets on a body from the body's own shape; sign: away from the centroid where curved.
+    """Unit normals (t, 3) of targets on a body from the body's own shape, see :func:`shape_normals`."""
+    return shape_normals(points, neighbours)[0]
+
+
+def shape_normals(points: ArrayLike, neighbours: int = 6) -> tuple[Array, Array]:
+    """Unit normals (t, 3) from the body's own shape, and how loose (t,) rad they are.
+
+    Their sign is away from the centroid where the body is curved. Normals of the plane or sphere that most targets lie
+    on are not loose; those of a neighbourhood by the angle of its thickness over its width.
 
     Where most targets lie on a plane or sphere, these and targets a little above it (a scale bar on a plate) get the
     plane's normal or radial ones; all others those of planes through the nearest neighbours, or NaN where the
@@ -86,14 +94,14 @@ def body_normals(points: ArrayLike, neighbours: int = 6) -> Array:
     """
     p = np.asarray(points, dtype=float)
     t = len(p)
-    normals = np.full((t, 3), np.nan)
+    normals, loose = np.full((t, 3), np.nan), np.zeros(t)
     if t < 4:
         if t == 3:
             across = np.cross(p[1] - p[0], p[2] - p[0])
             length = np.linalg.norm(across)
             if length > 0:
                 normals[:] = across / length
-        return normals
+        return normals, loose
     centred = p - p.mean(axis=0)
     width = float(np.median(np.linalg.norm(p - np.median(p, axis=0), axis=1)))
     shape = _dominant_shape(p, 0.02 * width)
@@ -110,7 +118,7 @@ def body_normals(points: ArrayLike, neighbours: int = 6) -> Array:
             done = np.abs(distance / np.median(distance) - 1.0) < 0.05
             normals[done] = away[done] / distance[done, None]
         if done.all():
-            return normals
+            return normals, loose
     count = min(neighbours, t - 1)
     distance = np.linalg.norm(p[:, None] - p[None], axis=2)
     nearest = np.argsort(distance, axis=1)[:, : count + 1]
@@ -118,9 +126,10 @@ def body_normals(points: ArrayLike, neighbours: int = 6) -> Array:
     _, values, axes = np.linalg.svd(local, full_matrices=False)
     flat = (values[:, 2] < 0.25 * values[:, 1]) & ~done
     normals[flat] = axes[flat, 2]
+    loose[flat] = np.arctan2(values[flat, 2], values[flat, 1])
     inward = (np.einsum("ti,ti->t", normals, centred) < 0) & ~done
     normals[inward] *= -1.0
-    return normals
+    return normals, loose
 
 
 def rim_offset(points: ArrayLike, radii: ArrayLike, normals: ArrayLike | None = None) -> Array:

@@ -1,9 +1,12 @@
 """Sizes and directions of discs from the ellipses that they show."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from robcal.photogrammetry.discs import Discs, discs_from_ellipses, modelled_discs, size_ratio
+from robcal.photogrammetry.eccentricity import shape_normals
 from robcal.transforms import Array, transform
 from tests.photogrammetry.networks import Truth, disc_outline, make_network, polygon_axes
 
@@ -99,3 +102,16 @@ def test_normals_that_the_shape_cannot_tell_come_from_the_ellipses() -> None:
     _, normals = modelled_discs(discs(truth, axes, angle), np.full(24, DIAMETER), truth.points)
     assert normals is not None
     assert turned(normals, truth.normals).max() < 1.5
+
+
+def test_targets_of_different_heights_do_not_lean() -> None:
+    rng = np.random.default_rng(9)
+    truth = make_network(rng, "plate", images=40, targets=24)
+    raised = replace(truth, points=truth.points + rng.uniform(0.0, 0.06, (24, 1)) * truth.normals)
+    axes, angle = ellipses(raised)
+    shape = shape_normals(raised.points)[0]
+    leaning = turned(np.abs(shape), np.abs(raised.normals))
+    assert np.nanmax(leaning) > 2.0  # what the shape alone says
+    _, normals = modelled_discs(discs(raised, axes, angle), np.full(24, DIAMETER), raised.points)
+    assert normals is not None
+    assert turned(normals, raised.normals).max() < 1.0

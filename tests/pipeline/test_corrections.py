@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 
 from fixtures.campaigns import make_campaign
-from fixtures.own_station import make_own
+from fixtures.own_files import make_own
 from pipeline.runner import run_campaign
 
 

@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from fixtures.effects import Effect
-from fixtures.own_station import OwnPlan, draw_own_effect, kept_out_frames, make_own
+from fixtures.own_effects import draw_own_effect
+from fixtures.own_files import make_own
+from fixtures.own_station import OwnPlan, kept_out_frames
 from fixtures.signature import tip_error_mm
 from pipeline.calibrated import load_calibrated, predicted
 from pipeline.common_errors import common_errors
