@@ -146,7 +146,7 @@ def test_survey_alone_and_unknown_body(image_campaign: Path, detected: Path) -> 
 
 def test_as_a_process_nothing_but_the_sentence_is_printed(point_campaign: Path, tmp_path: Path) -> None:
     edit_yaml(point_campaign / "campaign.yaml", lambda d: d.update(mesurements=1))
-    arguments = [sys.executable, "-m", "pipeline.cli", "run", str(point_campaign), "--out", str(tmp_path / "run")]
+    arguments = [sys.executable, "-m", "pipeline", "run", str(point_campaign), "--out", str(tmp_path / "run")]
     done = subprocess.run(arguments, capture_output=True, text=True, timeout=120, env=os.environ, check=False)
     assert done.returncode == 1
     assert "Traceback" not in done.stderr
