@@ -67,12 +67,18 @@ def library_at(fit: Fit, recording: Recording, at: Tangents, tied: frozenset[str
     """Families that may act here and are not in the model already."""
     site = RobotSite(fit.model, at.variables, frozenset(fit.free), tied)
     present = {(a.family.key, tuple(sorted(a.constants.items()))) for a in fit.accepted}
-    single = {a.family.key for a in fit.accepted if len(a.family.grid) == 1 or a.family.continuous}
+    single = {a.family.key for a in fit.accepted if acts_once(a.family)}
     judged = {"camera_moved"} if recording.own_station else set()
     known = all_families(site, at.data, recording.ids, recording.body)
     named = [f for f in known if f.key not in single and f.cause not in judged]
     empirical = list(empirical_families(site)) if recording.observations_are_spatial else []
     return tuple(f for f in (*named, *empirical) if (f.key, tuple(sorted(f.grid[0].items()))) not in present)
+
+
+def acts_once(family: Family) -> bool:
+    """Whether a place has a cause of this kind at most once: its constants bend one law (a threshold, a torque scale,
+    a time constant), while jumps at several poses and waves of several orders may add up."""
+    return len(family.grid) == 1 or bool(family.continuous) or "threshold_Nm" in family.ordered
 
 
 def analyse(

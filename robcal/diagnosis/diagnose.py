@@ -296,6 +296,27 @@ def _covariance(look: Analysis, item: Accepted, held: Iterable[str]) -> Array:
     return cofactor[:count, :count]
 
 
+def told_through(final: Fit, item: Accepted, covariance: Array, factor: float) -> tuple[Array, Array]:
+    """Amplitudes (k,) and their covariance (k, k) for the final value of the parameter through which they act.
+
+    Only the product of both is in the law, so a parameter that the fit changed after the law was written changes the
+    amplitude; its uncertainty, and how it goes with the amplitudes', counts.
+    """
+    if item.family.through is None or item.family.through[0] not in final.free:
+        return item.values, covariance
+    name, written = item.family.through
+    value = final.model.parameters[name]
+    ratio = written / value
+    own = final.free.index(name)
+    number = next(k for k, other in enumerate(final.accepted) if other is item)
+    names = [f"{item.family.where}_{item.family.cause}_{number}.{short}" for short in item.names]
+    mixed = final.covariance[[final.free.index(full) for full in names], own] * factor
+    slope = -item.values * ratio / value
+    cross = np.outer(ratio * mixed, slope)
+    spread = ratio**2 * covariance + cross + cross.T + final.covariance[own, own] * factor * np.outer(slope, slope)
+    return item.values * ratio, spread
+
+
 def _finding(
     look: Analysis, item: Accepted, p_value: float, heldout: tuple[float, float], chosen: Selection
 ) -> Finding:
@@ -312,8 +333,9 @@ def _finding(
             others = rivals(look.families, named, look.ranked, look.stacks, projected, look.named & look.significant())
     factor = look.result.variance_factor
     covariance = _covariance(look, item, chosen.tied) * factor
-    told, sigma = numeric_sigma(family.report, item.values, item.constants, covariance)
     final = chosen.last.fit
+    values, spread = told_through(final, item, covariance, factor)
+    told, sigma = numeric_sigma(family.report, values, item.constants, spread)
     for name, (parameter, unit) in family.beside.items():
         if parameter in final.free:
             k = final.free.index(parameter)

@@ -17,7 +17,7 @@ from robcal.diagnosis.fitting import Accepted, Fit, fit
 from robcal.diagnosis.naming import refine
 from robcal.diagnosis.recording import Recording
 from robcal.diagnosis.scan import orthonormal_basis
-from robcal.physics.family import Array, Constants
+from robcal.physics.family import Array, Constants, Key
 from robcal.physics.usual import usual_size
 from robcal.robot.model import RobotModel
 
@@ -93,7 +93,7 @@ def select(
     number = np.arange(len(recording.observations.pose))
     most_blunders = int(settings.blunder_share * len(number))
     first: Analysis | None = None
-    barred: set[tuple[str, str, str | None]] = set()
+    barred: set[Key] = set()
     settled = False
     present = fit(model, recording, free)
     while True:
@@ -137,7 +137,7 @@ def _extended(
     recording: Recording,
     free: tuple[str, ...],
     look: Analysis,
-    barred: set[tuple[str, str, str | None]],
+    barred: set[Key],
     settings: SelectionSettings,
     tell: Callable[[str], None],
 ) -> Fit | None:

@@ -23,6 +23,7 @@ Array = NDArray[Any]
 """Real numbers, indices or masks: the diagnosis handles all three."""
 Constants = Mapping[str, float]
 Report = Callable[[Array, Constants], dict[str, object]]
+Key = tuple[str, str, str | None, tuple[str, ...]]
 
 DEG = float(np.degrees(1.0))
 PER_KNM = DEG * 1e3
@@ -77,6 +78,8 @@ class Family:
     frees : robot families: parameters the kernel has already, which the cause sets free (order of `parameters`).
     beside : parameters of the kernel that are fitted anyway and told with the cause: reported name to kernel name and
         factor to the reported unit.
+    through : parameter of the kernel by which the law multiplies its amplitudes, and the value that stands in the law:
+        amplitudes are told for the value that the parameter has in the end.
     displace : observation families: (data, constants) to displacements (m, k, parameters), see `ObservationData`.
     """
 
@@ -96,6 +99,7 @@ class Family:
     bases: Callable[[Constants], tuple[Basis, ...]] | None = None
     frees: tuple[str, ...] = ()
     beside: Mapping[str, tuple[str, float]] = field(default_factory=dict)
+    through: tuple[str, float] | None = None
     displace: Callable[[ObservationData, Constants], Array] | None = None
     covariates: tuple[str, ...] = ()
     default_prior: float = 1.5e-4
@@ -111,9 +115,10 @@ class Family:
         return np.array(self.priors) if self.priors else np.full(len(self.names(constants)), self.default_prior)
 
     @property
-    def key(self) -> tuple[str, str, str | None]:
-        """What makes the family one of its kind; `from` of a coupling is part of its constants."""
-        return (self.cause, self.where, self.direction)
+    def key(self) -> Key:
+        """What makes the family one of its kind; an axis may be dragged along by several others, so a coupling's
+        driving axis belongs to it."""
+        return (self.cause, self.where, self.direction, self.covariates if self.cause == "joint_coupling" else ())
 
 
 @dataclass(frozen=True)

@@ -109,6 +109,10 @@ def _backlash(site: RobotSite, joint: Joint) -> Iterator[Family]:
             law = f"where(abs(torque{k}) > threshold_Nm, 0.5*sign(torque{k}), {lag})"
         return (Basis(joint.frame, "q", law, "width", c),)
 
+    def report(v: Array, c: Constants) -> dict[str, object]:
+        told: dict[str, object] = {name: float(v[0]) * joint.factor}
+        return told | {"threshold_Nm": c["threshold_Nm"]} if c.get("threshold_Nm") else told
+
     yield Family(
         "backlash",
         "robot",
@@ -116,7 +120,7 @@ def _backlash(site: RobotSite, joint: Joint) -> Iterator[Family]:
         LETTER_OF_KIND[joint.own_angle],
         ("width",),
         (_lag(joint),),
-        lambda v, c: {name: float(v[0]) * joint.factor, **({"threshold_Nm": c["threshold_Nm"]} if c else {})},
+        report,
         "{where} has {" + name + ":.4f} " + joint.unit + " of backlash the model does not know",
         grid=grid,
         ordered={"threshold_Nm": every} if every else {},
@@ -128,10 +132,12 @@ def _backlash(site: RobotSite, joint: Joint) -> Iterator[Family]:
 
 def _thresholds(torque: Array) -> tuple[float, ...]:
     """Torques between which recorded loads lie, below which a joint may count as unloaded; up to nine tenths of the
-    poses, because a joint that is unloaded in all of them lags behind, which is another cause."""
+    poses, because a joint that is unloaded in all of them lags behind, which is another cause.
+
+    The first is zero: torques are known no better than the fit, so none is small for sure."""
     sizes = np.sort(np.abs(torque))
     between = 0.5 * (sizes[1:] + sizes[:-1])[: int(0.9 * len(sizes))]
-    between = np.unique(np.concatenate([[0.5 * sizes[0]], between]))
+    between = np.unique(np.concatenate([[0.0], between]))
     chosen = np.unique(np.linspace(0, len(between) - 1, MOST_THRESHOLDS).round().astype(int))
     return tuple(float(between[i]) for i in chosen)
 
@@ -324,6 +330,7 @@ def _counterbalance(site: RobotSite, joints: list[Joint]) -> Iterator[Family]:
             "A balancing torque of {torque_Nm:.0f} N m acts on {where} that the model does not know",
             # balancing cylinders and springs hang at the joint with the largest torque
             bases=bases,
+            through=(f"{joint.frame}.elastic_{joint.own_angle}", elastic),
             covariates=(f"q{joint.number}",),
             weight=0.7 if rank == 0 else 0.3 / (len(loaded) - 1),
         )

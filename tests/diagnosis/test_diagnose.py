@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from pipeline.stages.diagnose import own_elasticities
 from robcal.diagnosis.contract import as_contract
-from robcal.diagnosis.diagnose import diagnose
+from robcal.diagnosis.diagnose import diagnose, told_through
+from robcal.diagnosis.fitting import Accepted
 from robcal.diagnosis.result import Diagnosis
+from robcal.physics.family import Family
 from tests.diagnosis.recordings import concealed
 
 
@@ -88,3 +91,20 @@ def test_what_is_fitted_anyway_is_told_as_fitted_last(tmp_path: Path) -> None:
     name, unit = found.family.beside["linear_deg_per_kNm"]
     assert found.parameters["linear_deg_per_kNm"] == pytest.approx(diagnosis.model.parameters[name] * unit)
     assert 0.0 < found.sigma["linear_deg_per_kNm"] < found.parameters["linear_deg_per_kNm"]
+
+
+def test_torque_that_acts_through_a_compliance_is_told_for_the_compliance_of_the_end() -> None:
+    law, end, torque = 4e-6, 2e-6, np.array([30.0, 40.0])
+    family = Family(
+        "counterbalance", "robot", "axis2", "y", ("cosine", "sine"), (1.0, 1.0), lambda v, c: {}, "",
+        through=("axis2.elastic_pitch", law),
+    )  # fmt: skip
+    item = Accepted(family, {}, torque, np.zeros((2, 2)))
+    names = ("axis2.elastic_pitch", "axis2_counterbalance_0.cosine", "axis2_counterbalance_0.sine")
+    covariance = np.diag([(0.1 * end) ** 2, 0.0, 0.0])
+    model = SimpleNamespace(parameters={"axis2.elastic_pitch": end})
+    final = SimpleNamespace(free=names, accepted=(item,), covariance=covariance, model=model)
+    values, spread = told_through(final, item, np.eye(2), 1.0)  # type: ignore[arg-type]
+    # the same deflection through half the compliance takes twice the torque; a tenth of it is as uncertain
+    assert np.allclose(values, 2.0 * torque)
+    assert np.allclose(spread, 4.0 * np.eye(2) + 0.01 * np.outer(values, values))

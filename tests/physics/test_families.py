@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from robcal.diagnosis.analysis import acts_once
 from robcal.physics.family import Basis, numeric_sigma
 from robcal.physics.joint import joint_families
 from robcal.physics.site import RobotSite, exponential_law
@@ -90,6 +91,34 @@ def test_backlash_rests_on_the_loaded_flank_and_lags_without_load() -> None:
         basis.expression, {"torque2": np.array([100.0, -100.0, 5.0, 5.0]), "approach2": np.array([1.0, 1.0, 1.0, -1.0])}
     )
     assert np.allclose(values, [0.5, -0.5, -0.5, 0.5])
+
+
+def test_backlash_may_have_no_threshold_at_all() -> None:
+    family = next(f for f in families(site()) if f.cause == "backlash" and f.where == "axis2")
+    assert family.ordered["threshold_Nm"][0] == 0.0
+    (basis,) = family.bases({"threshold_Nm": 0.0})
+    loads = {"torque2": np.array([1e-3, -1e-3, 0.0]), "approach2": np.array([1.0, -1.0, 1.0])}
+    assert np.allclose(evaluate(basis.expression, loads), [0.5, -0.5, -0.5])
+    assert family.report(np.array([1e-4]), {"threshold_Nm": 0.0}).keys() == {"width_deg"}
+    assert family.report(np.array([1e-4]), {"threshold_Nm": 3.0})["threshold_Nm"] == 3.0
+
+
+def test_an_axis_may_be_dragged_along_by_several() -> None:
+    frames = tuple(Frame(f"axis{k}", "z", xyz=(0.3, 0.0, 0.1)) for k in (1, 2, 3))
+    angles = np.random.default_rng(1).normal(size=(3, 20))
+    variables = {f"q{k}": angles[k - 1] for k in (1, 2, 3)} | {"index": np.arange(20.0)}
+    variables |= {f"torque{k}": np.zeros(20) for k in (1, 2, 3)}
+    where = RobotSite(RobotModel("three", frames), variables, frozenset(), frozenset())
+    dragged = [f for f in joint_families(where) if f.cause == "joint_coupling" and f.where == "axis3"]
+    assert len(dragged) == 2
+    assert len({f.key for f in dragged}) == 2
+    assert acts_once(dragged[0])
+
+
+def test_causes_whose_constants_bend_one_law_act_once_at_a_place() -> None:
+    once = {f.cause: acts_once(f) for f in families(site())}
+    assert all(once[cause] for cause in ("backlash", "hysteresis", "lost_motion"))
+    assert not any(once[cause] for cause in ("zero_jump", "gear_ripple", "base_moved"))
 
 
 def test_warming_up_ends_at_its_duration() -> None:
