@@ -128,7 +128,8 @@ class Body:
             solution = np.linalg.lstsq(design, np.sum(centred**2, axis=1), rcond=None)[0]
             rays = centred - solution[:3]
             radii = np.linalg.norm(rays, axis=1)
-            if np.std(radii) < 0.02 * np.mean(radii):
+            width = float(np.median(np.linalg.norm(p - np.median(p, axis=0), axis=1)))
+            if np.std(radii) < 0.02 * min(float(np.mean(radii)), width):
                 out[known] = rays / radii[:, None]
         return out
 

@@ -115,7 +115,7 @@ def shape_normals(points: ArrayLike, neighbours: int = 6) -> tuple[Array, Array]
         else:
             away = p - centre
             distance = np.linalg.norm(away, axis=1)
-            done = np.abs(distance / np.median(distance) - 1.0) < 0.05
+            done = np.abs(distance - np.median(distance)) < 0.05 * min(width, float(np.median(distance)))
             normals[done] = away[done] / distance[done, None]
         if done.all():
             return normals, loose
@@ -149,7 +149,7 @@ def rim_offset(points: ArrayLike, radii: ArrayLike, normals: ArrayLike | None = 
     away = p - shape[0]
     distance = np.linalg.norm(away, axis=1)
     radius = float(np.median(distance))
-    on = (np.abs(distance / radius - 1.0) < 0.02) & (r < 0.5 * radius)
+    on = (np.abs(distance - radius) < 0.02 * min(width, radius)) & (r < 0.5 * radius)
     radial = away / distance[:, None]
     if normals is not None:
         on &= np.abs(np.einsum("ti,ti->t", np.nan_to_num(np.asarray(normals, dtype=float)), radial)) > _RADIAL
@@ -158,7 +158,11 @@ def rim_offset(points: ArrayLike, radii: ArrayLike, normals: ArrayLike | None = 
 
 
 def _dominant_shape(points: Array, tolerance: float) -> tuple[Array, Array | None] | None:
-    """(centre, normal) of a plane or (centre, None) of a sphere that holds 70 % of points (t, 3); None if neither."""
+    """(centre, normal) of a plane or (centre, None) of a sphere that holds 70 % of points (t, 3); None if neither.
+
+    ``tolerance`` (m): within which a plane or, where that is less than a fiftieth of its radius, a sphere holds a point:
+    targets of different heights on a plate are not on a huge sphere.
+    """
     t = len(points)
     needed = 0.7 * t
     triples = _triples(t)
@@ -178,11 +182,12 @@ def _dominant_shape(points: Array, tolerance: float) -> tuple[Array, Array | Non
     for _ in range(4):
         centre, radius, _ = fit_sphere(chosen)
         miss = np.abs(np.linalg.norm(points - centre, axis=1) - radius)
-        close = miss < max(0.02 * radius, float(np.quantile(miss, 0.7)))
+        near = min(0.02 * radius, tolerance)
+        close = miss < max(near, float(np.quantile(miss, 0.7)))
         if np.count_nonzero(close) < 6:
             return None
         chosen = points[close]
-    held = np.count_nonzero(miss < 0.02 * radius)
+    held = np.count_nonzero(miss < near)
     return (centre, None) if held >= needed else None
 
 

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from robcal.photogrammetry.bodies import Body
 from robcal.photogrammetry.camera import Camera, project
 from robcal.photogrammetry.eccentricity import body_normals, centre_shift, fit_sphere, rim_offset
 from tests.photogrammetry.networks import plate_points, polygon_centre, sphere_points
@@ -101,3 +102,12 @@ def test_a_dot_on_a_sphere_ends_below_its_centre() -> None:
     facets = np.abs(np.einsum("ti,ti->t", tilted, normals)) < 0.98
     assert not rim_offset(p, radii, tilted)[facets].any()
     assert not rim_offset(plate_points(np.random.default_rng(7), 40), radii).any()
+
+
+def test_targets_of_different_heights_on_a_plate_are_on_no_sphere() -> None:
+    rng = np.random.default_rng(5)
+    raised = plate_points(rng, 30)
+    raised[:, 2] += rng.uniform(0.0, 0.05, 30)
+    np.testing.assert_array_equal(rim_offset(raised, np.full(30, 0.01)), 0.0)
+    body = Body("plate", np.arange(30), raised)
+    assert np.isnan(body.estimated_normals()).all()
