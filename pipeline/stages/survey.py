@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -135,11 +137,16 @@ def size_of_marks(table: MarksTable) -> tuple[int, int]:
     return int(width), int(height)
 
 
+_MISREAD = 0.2
+"""Share of the usual number of images in which a code may be read that is not there."""
+
+
 def _not_on_it(campaign: Campaign, run: Run, name: str, source: BodySource) -> frozenset[int]:
-    """Targets of scale bars that the body file lists without coordinates and that no station camera has ever seen.
+    """Targets of scale bars that the body file lists without coordinates and that the station (nearly) never sees.
 
     A file may list the targets of scale bars (without coordinates): they were photographed with the body but are not on
-    it. A known distance between two of the body's own targets is stated in the same words; the station's images tell.
+    it. A known distance between two of the body's own targets is stated in the same words; the station's images tell:
+    one that is on the body is seen about as often as the others, a misread code now and then.
     """
     entry, station = source.survey_entry, campaign.entry.station
     if entry is None or station is None or station.body != name:
@@ -147,16 +154,23 @@ def _not_on_it(campaign: Campaign, run: Run, name: str, source: BodySource) -> f
     pairs = [*(bar.targets for bar in entry.scale_bars), *(length.targets for length in entry.check_lengths)]
     ends = {number for pair in pairs for number in pair}
     bare = ends & {t.id for t in source.file.targets if t.id is not None and t.xyz is None}
-    seen: set[int] = set()
+    seen: Counter[int] = Counter()
     if bare and any(camera.images for camera in campaign.cameras.values()):
         index: DetectionIndex = run.load("detect")
         for camera in campaign.cameras:
             for found in load_detections(run, index, f"station/{camera}").values():
-                seen |= set(found.code.tolist())
+                seen.update(set(found.code.tolist()))
     for images in campaign.cameras.values():
         if images.marks is not None:
-            seen |= set(images.marks.target.tolist())
-    return frozenset(bare - seen)
+            seen.update(images.marks.target.tolist())
+    own = [t.id for t in source.file.targets if t.id is not None and t.code is not None and t.id not in ends]
+    return hardly_seen(bare, seen, own)
+
+
+def hardly_seen(targets: Iterable[int], images: Mapping[int, int], own: Sequence[int]) -> frozenset[int]:
+    """Those of some targets that far fewer images (number by id) show than the body's own targets."""
+    usual = float(np.median([images.get(target, 0) for target in own])) if own else 0.0
+    return frozenset(target for target in targets if images.get(target, 0) <= _MISREAD * usual)
 
 
 def surveyed_body(name: str, file: BodyFile, done: SurveyResult, beside: frozenset[int] = frozenset()) -> Body:
