@@ -84,7 +84,7 @@ def diagnose(
         chosen = select(model, noise.apply(thin), free, tied, settings, tell)
         again = None
         if chosen.accepted and silent:
-            again = select(bare_model, noise.apply(thin), bare, tied, settings, tell)
+            again = select(bare_model, noise.apply(thin), bare, tied, settings, tell, chosen.first.family_wise)
         if again is not None and _information(again) < _information(chosen):
             chosen = again
         else:

@@ -45,20 +45,18 @@ class Posterior:
 
 def posterior(families: Sequence[Family], result: ScanResult) -> Posterior:
     """Evidence of each family, averaged over its grid."""
-    log_weight = np.full(len(families), -np.inf)
-    best = np.zeros(len(families), dtype=int)
-    order = np.argsort(result.family, kind="stable")
-    bounds = np.searchsorted(result.family[order], np.arange(len(families) + 1))
-    for f, family in enumerate(families):
-        rows = order[bounds[f] : bounds[f + 1]]
-        if len(rows) == 0:
-            continue
-        values = result.log_evidence[rows]
-        if not np.any(np.isfinite(values)):
-            continue
-        log_weight[f] = special.logsumexp(values) - np.log(len(family.grid)) + np.log(family.weight)
-        best[f] = result.grid[rows[int(np.argmax(values))]]
-    return Posterior(log_weight, best)
+    count = len(families)
+    top = np.full(count, -np.inf)
+    np.maximum.at(top, result.family, result.log_evidence)
+    seen = np.isfinite(top)
+    above = result.log_evidence - np.where(seen, top, 0.0)[result.family]
+    total = np.bincount(result.family, weights=np.exp(above), minlength=count)
+    places = np.array([len(family.grid) / family.weight for family in families])
+    log_weight = np.where(seen, top + np.log(np.where(seen, total, 1.0)) - np.log(places), -np.inf)
+    best = np.zeros(count, dtype=int)
+    first = np.flatnonzero(above == 0.0)[::-1]  # the first of equals is written last
+    best[result.family[first]] = result.grid[first]
+    return Posterior(log_weight, np.where(seen, best, 0))
 
 
 def refine(family: Family, constants: Constants, at: Tangents, fitted: Array, residual: Array) -> Constants:

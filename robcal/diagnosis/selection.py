@@ -85,8 +85,9 @@ def select(
     tied: frozenset[str],
     settings: SelectionSettings = DEFAULTS,
     tell: Callable[[str], None] = lambda text: None,
+    level: FamilyWise | None = None,
 ) -> Selection:
-    """Search for what is missing in a fitted model."""
+    """Search for what is missing in a fitted model; ``level`` is that of a search with nearly the same parameters."""
     accepted: tuple[Accepted, ...] = ()
     p_values: list[float] = []
     left_out: list[tuple[int, int]] = []
@@ -97,7 +98,8 @@ def select(
     settled = False
     present = fit(model, recording, free)
     while True:
-        look = analyse(present, recording, tied, runs=settings.runs, level=None if first is None else first.family_wise)
+        known = level if first is None else first.family_wise
+        look = analyse(present, recording, tied, runs=settings.runs, level=known)
         seen = newly_visible(look, tied) if accepted else ()
         if seen:
             free, tied = (*free, *seen), tied - set(seen)
@@ -113,8 +115,8 @@ def select(
             present = fit(model, recording, free, accepted)
             continue
         trial = None
-        level = settings.level * (settings.further if accepted else 1.0)
-        if look.p_value <= level and len(accepted) < settings.most:
+        least = settings.level * (settings.further if accepted else 1.0)
+        if look.p_value <= least and len(accepted) < settings.most:
             trial = _extended(model, recording, free, look, barred, settings, tell)
         if trial is not None:
             present, accepted = trial, trial.accepted
@@ -198,11 +200,12 @@ def choose(look: Analysis, open_to: Array | None = None) -> tuple[int, Constants
     """
     options: list[tuple[float, int, Constants]] = []
     allowed = look.significant() if open_to is None else look.significant() & open_to
-    for chosen in (look.named & allowed, ~look.named & allowed):
-        if not np.any(chosen & np.isfinite(look.ranked.log_weight)):
-            continue
-        family = look.top(chosen)
+    kinds = [look.named & allowed, ~look.named & allowed]
+    tops = [look.top(chosen) for chosen in kinds if np.any(chosen & np.isfinite(look.ranked.log_weight))]
+    for family in tops:
         constants = refine(look.families[family], look.constants(family), look.at, look.basis, look.residual)
+        if len(tops) == 1:
+            return family, constants
         weight = float(look.ranked.log_weight[family])
         after = extend(look, look.at.columns(look.families[family], constants))
         others = float(np.max(np.where(after.named, after.ranked.log_weight, -np.inf), initial=-np.inf))
