@@ -19,7 +19,7 @@ BLANK = Family("backlash", "robot", "axis1", "z", ("width",), (1e-4,), lambda v,
 def scanned(seed: int, count: int) -> tuple[list[Family], ScanResult]:
     rng = np.random.default_rng(seed)
     families = [
-        replace(BLANK, grid=tuple({"k": float(g)} for g in range(rng.integers(1, 5))), weight=float(rng.uniform(0.1, 1)))
+        replace(BLANK, grid=tuple({"k": float(g)} for g in range(rng.integers(1, 5))), weight=rng.uniform(0.1, 1.0))
         for _ in range(count)
     ]
     family = np.repeat(np.arange(count), [len(f.grid) for f in families])
