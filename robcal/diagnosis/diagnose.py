@@ -255,6 +255,7 @@ def _findings(
     final = chosen.last.fit
     findings = []
     error = _error(chosen.recording, before, verify)
+    left = at_first = _square(before)
     for k, item in enumerate(final.accepted):
         if item.family.frees and silent.issuperset(item.family.frees):
             continue
@@ -265,9 +266,15 @@ def _findings(
             look = analyse(rest, chosen.recording, chosen.tied, level=chosen.first.family_wise)
         partial = fit(model, chosen.recording, chosen.free, final.accepted[: k + 1])
         after = _error(chosen.recording, partial, verify)
-        findings.append(_finding(look, item, chosen.p_values[k], (error, after), chosen))
-        error = after
+        drop = (left - _square(partial)) / max(at_first - _square(final), 1e-300)
+        finding = _finding(look, item, chosen.p_values[k], (error, after), chosen)
+        findings.append(replace(finding, explained=float(np.clip(drop, 0.0, 1.0))))
+        error, left = after, _square(partial)
     return tuple(findings)
+
+
+def _square(fitted: Fit) -> float:
+    return float(fitted.residual @ fitted.residual)
 
 
 def _covariance(look: Analysis, item: Accepted, held: Iterable[str]) -> Array:
@@ -341,8 +348,6 @@ def _finding(
             k = final.free.index(parameter)
             told = {name: final.model.parameters[parameter] * unit} | told
             sigma = {name: float(np.sqrt(final.covariance[k, k] * factor)) * unit} | sigma
-    excess = float(look.residual @ look.residual) - factor * look.result.redundancy
-    explained = float(np.clip(projected @ look.residual / max(excess, 1e-300), 0.0, 1.0))
     carry = poses_that_carry(projected, look.fit.row_pose, chosen.recording.names)
     told = {
         name: chosen.recording.pose_name(float(str(value))) if name == "pose" else value for name, value in told.items()
@@ -359,7 +364,7 @@ def _finding(
         p_value,
         evidence,
         others,
-        explained,
+        1.0,
         carry,
         heldout,
         describe(family.sentence, family.where, family.direction, told),

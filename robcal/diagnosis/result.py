@@ -36,7 +36,7 @@ class Finding:
     p_value : family-wise probability of the scan in which it was found.
     log_evidence : logarithm of the Bayes factor against leaving it out.
     rivals : the rest of the 95 % set and every cause with the same signature.
-    explained : share of the whitened square sum above the noise that it explains, 0 to 1.
+    explained : its share, 0 to 1, of the drop of the whitened square sum by all causes, added in their order.
     poses : names of the poses that carry most of it.
     heldout : position error on kept-out poses in metres, before and after adding it.
     """

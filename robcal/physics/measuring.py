@@ -7,6 +7,7 @@ twist of the frame (translation first) for frames, metres along the wire for dis
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 
@@ -323,9 +324,13 @@ def _required(p_sensor: Array | None) -> Array:
 
 def describe(sentence: str, where: str, direction: str | None, told: Mapping[str, object]) -> str:
     """Fill a family's sentence: axis names are spelled out for people, lists shortened to three decimals."""
-    place = where.replace("axis", "axis ") if where.startswith("axis") else where
+
+    def spelled(place: object) -> object:
+        return re.sub(r"^axis(\d+)$", r"axis \1", place) if isinstance(place, str) else place
+
     shown = {
-        name: ", ".join(f"{x:.3f}" for x in value) if isinstance(value, list) else value for name, value in told.items()
+        name: ", ".join(f"{x:.3f}" for x in value) if isinstance(value, list) else spelled(value)
+        for name, value in told.items()
     }
-    text = sentence.format(where=place, direction=direction or "", **shown)
+    text = sentence.format(where=spelled(where), direction=direction or "", **shown)
     return text[0].upper() + text[1:]

@@ -95,7 +95,7 @@ def _wobble(site: RobotSite, joint: Joint) -> Iterator[Family]:
             ("cosine", "sine"),
             (2e-4, 2e-4),
             report,
-            "The axis of {where} wobbles about {direction} by {amplitude_deg:.4f} deg, {order} times a turn",
+            "{where} wobbles about {direction} by {amplitude_deg:.4f} deg, {order} times a turn",
             grid=({"order": 1.0}, {"order": 2.0}, {"order": 3.0}),
             bases=bases,
             covariates=(f"q{joint.number}",),

@@ -35,6 +35,7 @@ def test_single_cause_is_named_where_it_is(tmp_path: Path, seed: int, cause: str
     diagnosis, truth = run(tmp_path, seed, cause)
     effect = truth.plan.effects[0]
     assert [f.family.cause for f in diagnosis.findings] == [cause]
+    assert diagnosis.findings[0].explained == pytest.approx(1.0)
     assert diagnosis.findings[0].family.where == effect.where
     before, after, floor = diagnosis.heldout
     assert after < before
@@ -108,3 +109,11 @@ def test_torque_that_acts_through_a_compliance_is_told_for_the_compliance_of_the
     # the same deflection through half the compliance takes twice the torque; a tenth of it is as uncertain
     assert np.allclose(values, 2.0 * torque)
     assert np.allclose(spread, 4.0 * np.eye(2) + 0.01 * np.outer(values, values))
+
+
+def test_shares_of_a_mixture_add_up(tmp_path: Path) -> None:
+    diagnosis, _ = run(tmp_path, 118, "zero_jump", "gear_ripple", snr=20.0)
+    shares = [finding.explained for finding in diagnosis.findings]
+    assert len(shares) >= 2
+    assert min(shares) > 0.05
+    assert sum(shares) == pytest.approx(1.0, abs=0.05)

@@ -8,6 +8,7 @@ import pytest
 from robcal.diagnosis.analysis import acts_once
 from robcal.physics.family import Basis, numeric_sigma
 from robcal.physics.joint import joint_families
+from robcal.physics.measuring import describe
 from robcal.physics.site import RobotSite, exponential_law
 from robcal.physics.structure import structure_families
 from robcal.robot.model import Frame, Payload, RobotModel
@@ -112,6 +113,8 @@ def test_an_axis_may_be_dragged_along_by_several() -> None:
     dragged = [f for f in joint_families(where) if f.cause == "joint_coupling" and f.where == "axis3"]
     assert len(dragged) == 2
     assert len({f.key for f in dragged}) == 2
+    told = dragged[0].report(np.array([1e-4]), {})
+    assert describe(dragged[0].sentence, "axis3", "z", told).startswith("Axis 3 is dragged along by axis 1: 1.00e-04")
     assert acts_once(dragged[0])
 
 
