@@ -30,6 +30,7 @@ _MAX_DEPTH = 7
 _CROSS = np.ones((5, 5), np.uint8)
 _NEIGHBOURS = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], np.uint8)
 _BAND = 32  # rows
+_TURN = np.arange(16) * (np.pi / 8.0)
 _AROUND = 4  # px from the middle of the smallest parts to what is taken for their background
 _MANY = 8  # parts of a node from which it pays to look at the smallest together
 _PEAK_BY_CONTRAST = 0.6  # of a spot in the corner of a pixel
@@ -80,7 +81,7 @@ def find_candidates(image: NDArray, noise: NoiseModel, settings: DetectionSettin
     while nodes and visited < _MAX_NODES:
         visited += 1
         _split(nodes.pop(), image, noise, settings, nodes, found, log)
-    rows = _distinct(np.array(found, dtype=float).reshape(-1, 8))
+    rows = _distinct(image, np.array(found, dtype=float).reshape(-1, 8))
     if len(rows) > settings.max_candidates:
         order = np.argsort(-(rows[:, 6] - rows[:, 5]))
         log.count(Reason.OVER_CAP, len(rows) - settings.max_candidates)
@@ -165,8 +166,8 @@ def _finer_nodes(
     return nodes
 
 
-def _distinct(rows: Array) -> Array:
-    """Blobs (n, 8) without those found twice; of these the one with the higher base fits its surroundings better."""
+def _distinct(image: NDArray, rows: Array) -> Array:
+    """Blobs (n, 8) without those found twice; of these the one whose base is nearer to the grey values around it."""
     if len(rows) < 2:
         return rows
     keep = np.ones(len(rows), bool)
@@ -176,8 +177,19 @@ def _distinct(rows: Array) -> Array:
         a, b = rows[first], rows[second]
         close = np.hypot(a[0] - b[0], a[1] - b[1]) < 0.35 * min(a[3], b[3])
         if close and 0.7 < a[2] / b[2] < 1.43 and 0.7 < a[3] / b[3] < 1.43:
-            keep[first if a[5] < b[5] else second] = False
+            around = _surroundings(image, a if a[2] > b[2] else b)
+            keep[first if abs(a[5] - around) > abs(b[5] - around) else second] = False
     return rows[keep]
+
+
+def _surroundings(image: NDArray, row: Array) -> float:
+    """Median grey value on an ellipse half as large again as a blob, in the gap between a dot and its code ring."""
+    x, y, major, minor, angle = row[:5]
+    u, v = (1.5 * major + 1.0) * np.cos(_TURN), (1.5 * minor + 1.0) * np.sin(_TURN)
+    c, s = np.cos(angle), np.sin(angle)
+    columns = np.clip(np.rint(x + c * u - s * v), 0, image.shape[1] - 1).astype(int)
+    lines = np.clip(np.rint(y + s * u + c * v), 0, image.shape[0] - 1).astype(int)
+    return float(np.median(image[lines, columns]))
 
 
 def _boxes(

@@ -334,6 +334,12 @@ def _extended(body: Body, camera: Camera, starts: Sequence[_Start]) -> list[Iden
     return [IdentifiedImage(g.rows, g.ids, g.pose, g.start.method) for g in images]
 
 
+_INSIDE_RING = 1.2
+"""Search radius of a dot within a code ring by its radius: parts of its ring lie from two radii on, less when tilted."""
+_LEAST_GATE = 3.0
+"""px"""
+
+
 def predict_dots(
     camera: Camera, pose: Array, covariance: Array | None, body: Body, targets: IntArray, error_px: float
 ) -> tuple[Array, Array, Array]:
@@ -361,5 +367,7 @@ def predict_dots(
     with np.errstate(invalid="ignore", divide="ignore"):
         size = camera.fx * 0.5 * body.diameters[targets] / p[:, 2]
     gate = np.where(np.isfinite(variance), _GATE * np.sqrt(np.maximum(variance, 0.01)), 0.0)
+    ringed = np.array([code == "ring12" for code in body.codes], dtype=bool)[targets] & np.isfinite(size)
+    gate = np.where(ringed, np.minimum(gate, np.maximum(_INSIDE_RING * size, _LEAST_GATE)), gate)
     return xy, gate, size
 

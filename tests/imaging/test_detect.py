@@ -4,6 +4,10 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from fixtures.own_images import image_plan, own_plate
+from fixtures.own_station import draw_own
+from fixtures.render import render_image
+from fixtures.scene import Lighting, Scene
 from robcal.errors import InvalidInput
 from robcal.imaging.cramer_rao import centre_bound
 from robcal.imaging.detect import detect_targets, saturation_level
@@ -236,3 +240,16 @@ def test_hot_pixels_do_not_pull_centres() -> None:
 def test_settings_are_checked(wrong: dict) -> None:
     with pytest.raises(InvalidInput):
         DetectionSettings(**wrong)
+
+
+def test_dark_codes_on_a_small_bright_plate_before_a_dark_room() -> None:
+    # dots are as dark as what is beside the plate
+    truth = draw_own(image_plan(7103, robot="irb120"))
+    pose = truth.robot.recorded.ids.index("p025")
+    body, camera = own_plate(7103, "irb120"), truth.cameras["left"]
+    world_T_body = truth.robot.true_frames[pose]
+    scene_ = Scene(((body, world_T_body),), Lighting(0.7, 0.45), texture_seed=7110)
+    image = render_image(scene_, camera, truth.base_T_camera["left"]).image
+    codes = frozenset(int(i) for i in body.ids)
+    found = detect_targets(image, DetectionSettings(polarity="dark", known_codes=codes))
+    assert codes <= set(found.code.tolist())

@@ -9,7 +9,7 @@ from robcal.imaging.detections import TargetKind
 from robcal.photogrammetry.bodies import Body
 from robcal.photogrammetry.camera import Camera, project
 from robcal.photogrammetry.identify_station import identify_station, spread_order
-from robcal.photogrammetry.identify_targets import Prediction, identify_images, identify_targets
+from robcal.photogrammetry.identify_targets import Prediction, identify_images, identify_targets, predict_dots
 from robcal.photogrammetry.resection import resect
 from robcal.transforms import exp_so3, frame, invert, retract, transform
 from tests.photogrammetry.stations import PLATE, simulate
@@ -176,3 +176,11 @@ def test_spread_order_takes_the_far_points_first():
     assert set(order[:4]) == {0, 2, 3, 4}
     assert order[4] == 5
     assert sorted(order) == [0, 1, 2, 3, 4, 5]
+
+
+def test_parts_of_a_code_ring_are_not_taken_for_its_dot():
+    points = np.column_stack([np.linspace(-0.2, 0.2, 6), np.linspace(-0.1, 0.1, 6) ** 2, np.zeros(6)])
+    body = _body(points, np.arange(6) < 5)
+    _, gate, size = predict_dots(CAMERA, POSE, None, body, np.arange(6), 4.0)
+    assert (gate[:5] < 1.3 * size[:5]).all()  # parts of the ring lie from two radii on
+    assert gate[5] == pytest.approx(20.0)  # what is but a dot may be anywhere near
