@@ -160,8 +160,8 @@ def rim_offset(points: ArrayLike, radii: ArrayLike, normals: ArrayLike | None = 
 def _dominant_shape(points: Array, tolerance: float) -> tuple[Array, Array | None] | None:
     """(centre, normal) of a plane or (centre, None) of a sphere that holds 70 % of points (t, 3); None if neither.
 
-    ``tolerance`` (m): within which a plane or, where that is less than a fiftieth of its radius, a sphere holds a point:
-    targets of different heights on a plate are not on a huge sphere.
+    ``tolerance`` (m): within which a plane or, where that is less than a fiftieth of its radius, a sphere holds a
+    point: targets of different heights on a plate are not on a huge sphere.
     """
     t = len(points)
     needed = 0.7 * t

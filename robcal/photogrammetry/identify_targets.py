@@ -335,7 +335,7 @@ def _extended(body: Body, camera: Camera, starts: Sequence[_Start]) -> list[Iden
 
 
 _INSIDE_RING = 1.2
-"""Search radius of a dot within a code ring by its radius: parts of its ring lie from two radii on, less when tilted."""
+"""Search radius of a dot within a code ring by its radius: parts of the ring lie from two radii on, less if tilted."""
 _LEAST_GATE = 3.0
 """px"""
 
