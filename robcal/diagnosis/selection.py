@@ -17,10 +17,12 @@ from robcal.diagnosis.fitting import Accepted, Fit, fit
 from robcal.diagnosis.naming import refine
 from robcal.diagnosis.recording import Recording
 from robcal.diagnosis.scan import orthonormal_basis
-from robcal.physics.family import Array, Constants, Key
+from robcal.physics.family import Array, Constants, Family, Key
 from robcal.physics.usual import usual_size
 from robcal.robot.model import RobotModel
 
+DOUBT = 6.0
+"""Evidence that a law loses by leaving something significant at its own place: two causes there are rare."""
 VISIBLE_SIGMA = 5.0
 """Signal in sigma from which a parameter of usual size is worth fitting."""
 
@@ -115,8 +117,7 @@ def select(
             present = fit(model, recording, free, accepted)
             continue
         trial = None
-        least = settings.level * (settings.further if accepted else 1.0)
-        if look.p_value <= least and len(accepted) < settings.most:
+        if look.p_value <= _level(look, accepted, settings) and len(accepted) < settings.most:
             trial = _extended(model, recording, free, look, barred, settings, tell)
         if trial is not None:
             present, accepted = trial, trial.accepted
@@ -134,6 +135,13 @@ def select(
     return Selection(recording, present.accepted, tuple(p_values), first, look, free, tied, tuple(left_out))
 
 
+def _level(look: Analysis, accepted: tuple[Accepted, ...], settings: SelectionSettings) -> float:
+    """Level that the next cause must reach; what is left where a cause was named already puts the name in doubt."""
+    place = look.families[look.top(np.ones(len(look.families), dtype=bool))].where
+    elsewhere = bool(accepted) and all(item.family.where != place for item in accepted)
+    return settings.level * (settings.further if elsewhere else 1.0)
+
+
 def _extended(
     model: RobotModel,
     recording: Recording,
@@ -146,7 +154,7 @@ def _extended(
     """The fit with the best family added; families whose refit does not keep the linear promise are barred."""
     for _ in range(settings.most_futile):
         open_to = np.array([family.key not in barred for family in look.families])
-        choice = choose(look, open_to)
+        choice = choose(look, open_to, settings.level)
         if choice is None:
             return None
         family, constants = choice
@@ -192,7 +200,19 @@ def _is_blunder(look: Analysis, settings: SelectionSettings) -> bool:
     return bool(significant and look.suspect.log_evidence > np.max(look.ranked.log_weight))
 
 
-def choose(look: Analysis, open_to: Array | None = None) -> tuple[int, Constants] | None:
+def _beside(family: Family, after: Analysis, level: float) -> float:
+    """What speaks for a family beyond its own evidence: the best name for what it leaves; what it leaves where it acts
+    itself speaks against it."""
+    left = after.families[after.top(np.ones(len(after.families), dtype=bool))]
+    if after.p_value <= level and (left.where, left.direction) == (family.where, family.direction):
+        return -DOUBT
+    others = float(np.max(np.where(after.named, after.ranked.log_weight, -np.inf), initial=-np.inf))
+    return max(others, 0.0)
+
+
+def choose(
+    look: Analysis, open_to: Array | None = None, level: float = DEFAULTS.level
+) -> tuple[int, Constants] | None:
     """The family to be added: best name or, where that explains less, the best empirical term.
 
     Only families that a test finds by themselves: evidence alone would take whatever costs little and explains nothing
@@ -206,10 +226,9 @@ def choose(look: Analysis, open_to: Array | None = None) -> tuple[int, Constants
         constants = refine(look.families[family], look.constants(family), look.at, look.basis, look.residual)
         if len(tops) == 1:
             return family, constants
-        weight = float(look.ranked.log_weight[family])
         after = extend(look, look.at.columns(look.families[family], constants))
-        others = float(np.max(np.where(after.named, after.ranked.log_weight, -np.inf), initial=-np.inf))
-        options.append((weight + max(others, 0.0), family, constants))
+        value = float(look.ranked.log_weight[family]) + _beside(look.families[family], after, level)
+        options.append((value, family, constants))
     if not options:
         return None
     _, family, constants = max(options, key=lambda option: option[0])
@@ -239,7 +258,7 @@ def _backward(
             del probabilities[k]
             changed = True
             continue
-        choice = choose(look)
+        choice = choose(look, level=settings.level)
         if choice is None:
             k += 1
             continue
