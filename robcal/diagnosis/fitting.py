@@ -21,6 +21,8 @@ MOST_FREE = 12
 """A law with more amplitudes than these is a Gaussian process: its prior goes into the fit."""
 TERM_PARTS = 24
 """Amplitudes in one expression of the kernel, which may not grow without end."""
+RELEASE = 4.0
+"""Factor by which steps may grow after one that lowered the square sum."""
 LARGEST_STEP = 5.0
 """Largest step of a parameter that makes sense, in its usual sizes."""
 MANY = 120
@@ -118,7 +120,7 @@ def fit(
     free: Sequence[str],
     accepted: Sequence[Accepted] = (),
     *,
-    iterations: int = 8,
+    iterations: int = 20,
     statics: str = "converged",
 ) -> Fit:
     """Least squares of the free parameters and all accepted causes together, from the model's present values.
@@ -151,9 +153,18 @@ def fit(
     sizes = {f"{term.name}.{short}": size for term in model.terms for short, size in term.priors.items()}
     held = np.array([k for k, name in enumerate(names) if name in sizes], dtype=np.intp)
     prior = np.zeros((len(held), width))
-    previous, scale = np.inf, 0.0
+    scale, room = 0.0, 1.0
+    best: tuple[float, Array, Array, Array] | None = None
     for _ in range(iterations):
         _, residual, jacobian = linearised()
+        cost = _least(residual, jacobian[:, len(columns) :])
+        if best is None or cost <= best[0]:
+            # as long as steps keep their promise the damping fades, and the last ones are undamped
+            room = room if best is None else room * RELEASE
+            best = (cost, theta.copy(), residual, jacobian)
+        else:
+            room /= RELEASE**2
+            theta, residual, jacobian = best[1].copy(), best[2], best[3]
         if len(held):
             # a prior weighs against observations of the variance that they show
             scale = scale or float(np.sqrt(residual @ residual / len(residual)))
@@ -161,15 +172,13 @@ def fit(
         # steps are damped by the size that deviations can have: near-parallel axes leave directions that a full
         # step would follow beyond all linearity
         rows = np.concatenate([residual, np.zeros(len(brake)), -prior[:, held] @ theta[columns[held]]])
-        step = solve(np.vstack([jacobian, brake, prior]), rows)[: len(columns)]
+        step = solve(np.vstack([jacobian, brake / room, prior]), rows)[: len(columns)]
         if len(held):
             left = residual - jacobian[:, : len(columns)] @ step
             scale = float(np.sqrt(left @ left / max(len(left) - width, 1)))
         theta[columns] += step
-        change = float(np.sum((jacobian[:, : len(columns)] @ step) ** 2))
-        if change < 1e-6 or abs(previous - change) < 1e-14:
+        if float(np.sum((jacobian[:, : len(columns)] @ step) ** 2)) < 1e-6:
             break
-        previous = change
     frames, residual, jacobian = linearised()
     # displacements of observations are linear: their amplitudes follow from the last linear problem
     linear = solve(jacobian, residual)[len(columns) :] if direct else np.zeros(0)
@@ -193,6 +202,12 @@ def fit(
         -prior[:, : len(columns)] @ theta[columns],
         recording.common_errors(residual),
     )
+
+
+def _least(residual: Array, columns: Array) -> float:
+    """Square sum (of whitened rows) that is left beside displacements of observations."""
+    left = residual - columns @ solve(columns, residual) if columns.shape[1] else residual
+    return float(left @ left)
 
 
 def damping(names: Sequence[str], columns: int, variables: Mapping[str, Array]) -> Array:

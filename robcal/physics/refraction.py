@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
 from robcal.physics.family import Array, Constants, Family, ObservationData
+
+STEP = 1e-3
+"""Metres over which the field is differentiated: it is a polynomial of the second degree, so any will do."""
 
 
 def refraction_families(data: ObservationData) -> Iterator[Family]:
@@ -14,6 +17,25 @@ def refraction_families(data: ObservationData) -> Iterator[Family]:
     yield from (_bent_sight(data, axis) for axis in range(3))
     yield from (_bent_from_origin(axis) for axis in range(3))
     yield _warped(data)
+
+
+def _warping(field: Callable[[Array], Array]) -> Callable[[ObservationData, Constants], Array]:
+    """Displacements of observations for a field of displacements, points (m, 3) to (m, 3, k).
+
+    A frame moves as its origin does and turns by half the curl of the field there, as a small body does.
+    """
+
+    def displace(d: ObservationData, c: Constants) -> Array:
+        shift = field(d.p_world)
+        if d.kind != "frames":
+            return shift
+        ahead, behind = ([field(d.p_world + side * STEP * e) for e in np.eye(3)] for side in (1.0, -1.0))
+        slope = (np.stack(ahead) - np.stack(behind)) / (2.0 * STEP)  # (derivative by, m, component, k)
+        turn = 0.5 * np.stack([slope[i, :, j] - slope[j, :, i] for i, j in ((1, 2), (2, 0), (0, 1))], axis=1)
+        R = np.swapaxes(d.world_T_tool[:, :3, :3], 1, 2)
+        return np.concatenate([R @ shift, R @ turn], axis=1)
+
+    return displace
 
 
 def _bend(arm: Array, axis: int) -> Array:
@@ -32,8 +54,8 @@ def _bent_sight(data: ObservationData, axis: int) -> Family:
     """
     centre = data.p_world.mean(axis=0)
 
-    def bent(d: ObservationData, c: Constants) -> Array:
-        arm = d.p_world - centre
+    def bent(points: Array) -> Array:
+        arm = points - centre
         out = np.zeros((len(arm), 3, 4))
         out[:, :, 0] = _bend(arm, axis)
         for k in range(3):
@@ -59,15 +81,15 @@ def _bent_sight(data: ObservationData, axis: int) -> Family:
     return Family(
         "refraction", "camera", "station", letter, names, (2e-5, 1e-4, 1e-4, 1e-4), report,
         "The lines of sight of the station bend along {direction} (refraction), {curvature_per_km:.4f} per km",
-        displace=bent, weight=0.125,
+        displace=_warping(bent), weight=0.125,
     )  # fmt: skip
 
 
 def _bent_from_origin(axis: int) -> Family:
     """The same for an instrument that stands where its coordinates begin, as trackers do: one number."""
 
-    def bent(d: ObservationData, c: Constants) -> Array:
-        return _bend(d.p_world, axis)[:, :, None]
+    def bent(points: Array) -> Array:
+        return _bend(points, axis)[:, :, None]
 
     letter = "xyz"[axis]
 
@@ -82,7 +104,7 @@ def _bent_from_origin(axis: int) -> Family:
     return Family(
         "refraction", "camera", "station", letter, ("curvature",), (2e-5,), report,
         "The lines of sight of the station bend along {direction} (refraction), {curvature_per_km:.4f} per km",
-        displace=bent, weight=0.125,
+        displace=_warping(bent), weight=0.125,
     )  # fmt: skip
 
 
@@ -94,8 +116,8 @@ def _warped(data: ObservationData) -> Family:
     """
     centre = data.p_world.mean(axis=0)
 
-    def bent(d: ObservationData, c: Constants) -> Array:
-        x, y, z = (d.p_world - centre).T
+    def bent(points: Array) -> Array:
+        x, y, z = (points - centre).T
         squares = np.stack([x * x, y * y, z * z, x * y, x * z, y * z], axis=1)
         return np.einsum("mq,ij->miqj", squares, np.eye(3)).reshape(len(x), 3, -1)
 
@@ -109,6 +131,6 @@ def _warped(data: ObservationData) -> Family:
 
     return Family(
         "refraction", "camera", "station", None, names, (1e-4,) * len(names), report,
-        "The lines of sight of the station are bent (refraction): the measured space is warped", displace=bent,
-        weight=0.25,
+        "The lines of sight of the station are bent (refraction): the measured space is warped",
+        displace=_warping(bent), weight=0.25,
     )  # fmt: skip

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from robcal.physics.family import ObservationData
 from robcal.physics.measuring import measuring_families
+from robcal.transforms import frame_from_xyzrpy
 
 AXES = "xyz"
 
@@ -49,3 +52,22 @@ def test_an_instrument_at_the_origin_needs_one_number() -> None:
     named = [f for f in measuring_families(seen, (0, 1, 2, 3, 4), "plate") if f.cause == "refraction"]
     upright = next(f for f in named if f.direction == "z" and len(f.parameters) == 1)
     assert np.allclose(upright.displace(seen, {})[:, :, 0], bend_from(points, np.zeros(3), np.array([0.0, 0.0, 1.0])))
+
+
+def test_frames_are_displaced_as_the_points_on_them() -> None:
+    rng = np.random.default_rng(5)
+    T = frame_from_xyzrpy(rng.normal(size=(8, 6)))
+    corners = 1e-4 * np.vstack([np.eye(3), -np.eye(3)])
+    frames = replace(data(T[:, :3, 3]), kind="frames", world_T_tool=T)
+    of_points = data((corners @ np.swapaxes(T[:, :3, :3], 1, 2) + T[:, None, :3, 3]).reshape(-1, 3))
+    named = [f for f in measuring_families(of_points, (0, 1, 2, 3, 4), "plate") if f.cause == "refraction"]
+    assert len(named) == 7
+    for family in named:
+        twist = family.displace(frames, {})
+        assert twist.shape == (8, 6, len(family.parameters))
+        moved = family.displace(of_points, {}).reshape(8, 6, 3, -1)
+        for k in range(8):
+            local = np.einsum("ij,pik->pjk", T[k, :3, :3], moved[k])  # as seen in the frame
+            turned = np.cross(corners[:, :, None], local, axis=1).sum(axis=0) / (4 * 1e-8)
+            assert np.allclose(twist[k, :3], local.mean(axis=0), atol=1e-6)
+            assert np.allclose(twist[k, 3:], turned, atol=1e-6)
