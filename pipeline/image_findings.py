@@ -17,6 +17,7 @@ from robcal.diagnosis.image_diagnosis import ImageDiagnosis, ImageFinding, diagn
 from robcal.diagnosis.image_exchange import exchanged_targets
 from robcal.diagnosis.image_station import given_points, station_data
 from robcal.diagnosis.lens_findings import beyond_lenses, station_findings, survey_findings
+from robcal.diagnosis.scale_findings import scale_findings
 from robcal.photogrammetry.camera import Camera
 from robcal.photogrammetry.station_network import StationMarks, StationOrientation
 from robcal.photogrammetry.survey_types import SurveyResult
@@ -55,6 +56,7 @@ def images_of(campaign: Campaign, run: Run) -> ImageFindings:
             path = source.survey.start_path
             camera = path.stem if path is not None else f"survey_{name}"
             findings += survey_findings(result.network, start.camera if start else None, camera)
+            findings += scale_findings(result.network, name)
             dots = any(target.code != "corner" for target in source.file.targets)
             scans.append(diagnose_images(survey_data(result.network, None, camera, name, dots=dots)))
             noise.append(result.network.sigma0)
