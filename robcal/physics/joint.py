@@ -14,7 +14,8 @@ from robcal.physics.usual import LEAST_MOMENT
 TORQUE_SCALES = (0.02, 0.06, 0.2, 0.5, 1.2)
 """Scales of a lost motion that are tried first, in shares of the largest load torque: joints are built for theirs."""
 MOST_THRESHOLDS = 60
-TRIED_THRESHOLDS = 8
+TRIED_THRESHOLDS = 14
+"""Tried first, densely where few poses count as unloaded: friction is small against loads."""
 HIGHEST_RIPPLE_ORDER = 180
 
 
@@ -96,8 +97,8 @@ def _backlash(site: RobotSite, joint: Joint) -> Iterator[Family]:
         return
     name = f"width_{joint.unit}"
     every = _thresholds(torque) if loaded and moved else ()
-    tried = np.unique(np.linspace(0, len(every) - 1, min(TRIED_THRESHOLDS, len(every))).round().astype(int))
-    grid: tuple[Constants, ...] = tuple({"threshold_Nm": every[i]} for i in tried) or ({},)
+    tried = np.unique(np.geomspace(1, max(len(every), 1), TRIED_THRESHOLDS).round().astype(int)) - 1
+    grid: tuple[Constants, ...] = tuple({"threshold_Nm": every[i]} for i in tried if every) or ({},)
 
     def bases(c: Constants) -> tuple[Basis, ...]:
         lag = f"-0.5*approach{k}"
