@@ -17,8 +17,8 @@ from robcal.robot.terms import identifier
 
 BUMPS = (4, 7, 12)
 """Numbers of bumps over the range of a covariate: three lengths over which it may vary."""
-EMPIRICAL_WEIGHT = 0.2
-"""Prior weight of all empirical families together, against one for each named cause."""
+EMPIRICAL_WEIGHT = 0.5
+"""Prior weight of all empirical families together, against one for each named cause: the library holds most."""
 
 CURVE_PRIOR = 3e-4
 """Typical amplitude of one bump of a joint's error curve, rad."""
@@ -59,6 +59,7 @@ def _formula(bases: tuple[Basis, ...], values: Array) -> str:
 
 
 def _smooth(site: RobotSite, joint: Joint, kind: str, covariate: str) -> Family:
+    """A smooth law of a covariate; beyond the values recorded it stays as at their end."""
     values = site.variables[covariate]
     low, high = float(np.min(values)), float(np.max(values))
 
@@ -70,9 +71,9 @@ def _smooth(site: RobotSite, joint: Joint, kind: str, covariate: str) -> Family:
             Basis(
                 joint.frame,
                 kind,
-                f"exp(-0.5*(({covariate} - centre)/width)**2)",
+                f"exp(-0.5*((minimum(maximum({covariate}, low), high) - centre)/width)**2)",
                 f"c{i}",
-                {"centre": x, "width": width},
+                {"low": low, "high": high, "centre": x, "width": width},
             )
             for i, x in enumerate(centres)
         )

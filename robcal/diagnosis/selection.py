@@ -23,6 +23,8 @@ from robcal.robot.model import RobotModel
 
 DOUBT = 6.0
 """Evidence that a law loses by leaving something significant at its own place: two causes there are rare."""
+SECOND = 3.0
+"""Evidence that the name for what is left must have before it counts: most recordings have one cause at most."""
 VISIBLE_SIGMA = 5.0
 """Signal in sigma from which a parameter of usual size is worth fitting."""
 
@@ -207,7 +209,7 @@ def _beside(family: Family, after: Analysis, level: float) -> float:
     if after.p_value <= level and (left.where, left.direction) == (family.where, family.direction):
         return -DOUBT
     others = float(np.max(np.where(after.named, after.ranked.log_weight, -np.inf), initial=-np.inf))
-    return max(others, 0.0)
+    return max(others - SECOND, 0.0)
 
 
 def choose(
