@@ -14,12 +14,13 @@ from pipeline.camera_file import CameraFile, write_camera
 from pipeline.campaign import Campaign, ImageSource
 from pipeline.image_findings import DOT_SIZES, image_covariates
 from pipeline.measurement_tables import MarksTable
-from pipeline.moved_cameras import which_moved, with_small_moves
+from pipeline.moved_cameras import robot_misfit
 from pipeline.poses_table import Poses
 from pipeline.runs import Run
 from pipeline.stages.base import Context, Outcome, Stage
 from pipeline.stages.detect import DetectionIndex, load_detections
 from pipeline.stages.survey import located, size_of_marks
+from robcal.diagnosis.camera_moves import which_moved, with_small_moves
 from robcal.diagnosis.dot_sizes import with_dot_sizes
 from robcal.diagnosis.image_data import ImageData
 from robcal.diagnosis.image_diagnosis import ImageFinding
@@ -71,7 +72,8 @@ def work(context: Context) -> Outcome:
         if campaign.entry.diagnosis.enabled:
             carried, sized = with_dot_sizes(body, lambda: data(orient(StationSettings())))
             orientation, again = with_small_moves(orient, data)
-            orientation = which_moved(orientation, again, campaign, marks)
+            if campaign.robot is not None:
+                orientation = which_moved(orientation, again, lambda tried: robot_misfit(campaign, tried, marks))
         else:
             orientation = orient(StationSettings())
     except RobcalError as error:

@@ -15,12 +15,12 @@ from fixtures.own_station import OwnPlan, kept_out_frames
 from fixtures.signature import tip_error_mm
 from pipeline.calibrated import load_calibrated, predicted
 from pipeline.common_errors import common_errors
-from pipeline.moved_cameras import epochs_of
 from pipeline.poses_table import read_poses
 from pipeline.runner import run_campaign
 from pipeline.runs import Run
 from pipeline.stages.diagnose import settings_beside
 from pipeline.stages.identify import load_identification
+from robcal.diagnosis.camera_moves import epochs_of
 from robcal.diagnosis.image_diagnosis import ImageFinding
 from robcal.diagnosis.selection import SelectionSettings
 

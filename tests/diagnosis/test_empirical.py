@@ -1,0 +1,42 @@
+"""Laws for what has no name: smooth inside the recorded values, constant beyond them, readable by the kernel."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from robcal.diagnosis.empirical import empirical_families
+from robcal.physics.family import Family
+from robcal.robot.terms import evaluate
+from tests.physics.test_families import site
+
+
+def smooth(covariate: str) -> Family:
+    return next(f for f in empirical_families(site()) if f.covariates == (covariate,) and len(f.grid) == 3)
+
+
+@given(st.floats(0.0, 1e3))
+def test_beyond_the_recorded_values_a_law_stays_as_at_their_end(far: float) -> None:
+    values = np.asarray(site().variables["q1"])
+    family = smooth("q1")
+    for constants in family.grid:
+        for basis in family.bases(constants):  # type: ignore[misc]
+            ends = basis.value({"q1": np.array([values.max(), values.min()])})
+            beyond = basis.value({"q1": np.array([values.max() + far, values.min() - far])})
+            np.testing.assert_array_equal(beyond, ends)
+
+
+def test_the_kernel_reads_the_same_law() -> None:
+    family = smooth("q2")
+    q = np.linspace(-4.0, 4.0, 50)
+    for basis in family.bases(family.grid[-1]):  # type: ignore[misc]
+        np.testing.assert_allclose(evaluate(basis.expression, {"q2": q}), basis.value({"q2": q}), rtol=1e-12)
+
+
+def test_all_of_them_share_one_weight() -> None:
+    families = list(empirical_families(site()))
+    assert {f.cause for f in families} == {"unknown"}
+    assert sum(f.weight for f in families) == pytest.approx(families[0].weight * len(families))
+    assert sum(f.weight for f in families) < 1.0
