@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,7 @@ from robcal.photogrammetry.camera import Camera
 from robcal.photogrammetry.identify_targets import (
     IdentifiedImage,
     Prediction,
+    coded_rows,
     identify_images,
     identify_targets,
     predict_dots,
@@ -24,6 +26,9 @@ from robcal.photogrammetry.station import orient_station
 from robcal.photogrammetry.station_network import StationMarks, StationOrientation, StationSettings
 from robcal.transforms import Array, invert
 
+_RECURS = 5
+_RECURRING_SHARE = 0.6
+"""A code is contradicted for good in at least so many images, and in this share of those in which it is read."""
 _ENOUGH = 30
 """Marks of an image with which the station is oriented for the second round: a pose from thirty is good to a few
 hundredths of a pixel, the gates are whole pixels."""
@@ -75,9 +80,42 @@ def identify_station(
     orientation = _orient(found, detections, body, cameras, sizes)
     if orientation is not None:
         _second_round(found, detections, body, orientation)
+    found = with_recurring_codes(found, detections, body)
     marks = {name: _marks(name, found, detections[name]) for name in sizes}
     problems = tuple((n, p, image.reason) for (n, p), image in sorted(found.items()) if image.reason)
     return StationIdentification(marks, found, problems)
+
+
+def with_recurring_codes(
+    found: Mapping[tuple[str, int], IdentifiedImage],
+    detections: Mapping[str, Mapping[int, Detections]],
+    body: Body,
+) -> dict[tuple[str, int], IdentifiedImage]:
+    """The images with those codes that the pose of nearly every image contradicts: no misreading recurs like that.
+
+    It is the target that sits elsewhere or carries another one's number; what comes after can tell only if it is there.
+    """
+    read: Counter[int] = Counter()
+    against: Counter[int] = Counter()
+    thrown: dict[tuple[str, int], tuple[IntArray, IntArray]] = {}
+    for (name, pose), image in found.items():
+        if image.method == "none":
+            continue
+        rows, ids = coded_rows(detections[name][pose], body)
+        out = ~np.isin(rows, image.rows) & ~np.isin(ids, image.ids)
+        thrown[name, pose] = rows[out], ids[out]
+        read.update(ids.tolist())
+        against.update(ids[out].tolist())
+    recurring = [target for target, n in against.items() if n >= max(_RECURS, _RECURRING_SHARE * read[target])]
+    result = dict(found)
+    for key, (rows, ids) in thrown.items():
+        again = np.isin(ids, recurring)
+        image = found[key]
+        if again.any():
+            result[key] = replace(
+                image, rows=np.concatenate([image.rows, rows[again]]), ids=np.concatenate([image.ids, ids[again]])
+            )
+    return result
 
 
 def _by_other_views(

@@ -101,7 +101,7 @@ def identify_images(
     ``predictions`` per image, None for none.
     """
     expected = [()] * len(images) if predictions is None else predictions
-    coded = [_coded(detections, body) for detections in images]
+    coded = [coded_rows(detections, body) for detections in images]
     placed = [body.known[body.index(ids)] if len(ids) else np.zeros(0, dtype=bool) for _, ids in coded]
     tasks: list[tuple[int, _Start]] = []
     for k, fit in _resected(images, coded, placed, body, camera, model_error_px).items():
@@ -228,7 +228,7 @@ def _uncoded(body: Body) -> NDArray[np.bool_]:
     return np.array([code is None for code in body.codes], dtype=bool)
 
 
-def _coded(detections: Detections, body: Body) -> tuple[IntArray, IntArray]:
+def coded_rows(detections: Detections, body: Body) -> tuple[IntArray, IntArray]:
     """Rows and ids of dots whose code belongs to the body; a code seen twice is no identification."""
     ring = np.array([c == "ring12" for c in body.codes], dtype=bool)
     marker = np.array([c is not None and c.startswith("aruco") for c in body.codes], dtype=bool)

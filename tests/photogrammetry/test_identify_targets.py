@@ -184,3 +184,23 @@ def test_parts_of_a_code_ring_are_not_taken_for_its_dot():
     _, gate, size = predict_dots(CAMERA, POSE, None, body, np.arange(6), 4.0)
     assert (gate[:5] < 1.3 * size[:5]).all()  # parts of the ring lie from two radii on
     assert gate[5] == pytest.approx(20.0)  # what is but a dot may be anywhere near
+
+
+def test_codes_that_every_image_contradicts_stay_for_the_adjustment_to_judge():
+    rng = np.random.default_rng(8)
+    points = np.column_stack([rng.uniform(-0.2, 0.2, (12, 2)), rng.uniform(0.0, 0.05, 12)])
+    body = _body(points, np.ones(12, bool))
+    poses = [
+        frame(exp_so3(rng.normal(0, 0.2, 3)) @ POSE[:3, :3], POSE[:3, 3] + rng.normal(0, 0.1, 3)) for _ in range(8)
+    ]
+    first, second, once = body.ids[2], body.ids[7], body.ids[4]
+    images = {}
+    for k, pose in enumerate(poses):
+        d, _ = _detections(body, CAMERA, pose, np.ones(12, bool), rng, 0)
+        d.code[:] = np.select([d.code == first, d.code == second], [second, first], d.code)
+        if k == 0:  # a code misread in one image only is no more than that
+            d.xy[d.code == once] += 60.0
+        images[k] = d
+    marks = identify_station({"left": images}, body, {"left": CAMERA}).marks["left"]
+    assert np.count_nonzero(marks.target == first) == np.count_nonzero(marks.target == second) == 8
+    assert np.count_nonzero(marks.target == once) == 7
