@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from robcal.diagnosis.fitting import Accepted, Fit
 from robcal.diagnosis.naming import Posterior, posterior
 from robcal.diagnosis.recording import Recording
 from robcal.diagnosis.scan import ScanResult, Stack, orthonormal_basis, restack, scan, stack_entries
-from robcal.physics.family import Array, Constants, Family
+from robcal.physics.family import Array, Constants, Family, ObservationData
 from robcal.physics.library import all_families
 from robcal.physics.site import RobotSite
 
@@ -124,7 +124,6 @@ def _look(
         family_wise = simulate(stacks, basis, redundancy, len(residual), runs=runs, freedom=freedom, block=groups)
     p_value = family_wise.probability(float(result.log_p[result.best]))
     named = np.array([family.cause != "unknown" for family in families])
-    suspect = worst_group(residual, basis, groups)
     return Analysis(
         fit,
         at,
@@ -137,8 +136,31 @@ def _look(
         ranked,
         family_wise,
         p_value,
-        suspect,
+        _suspect(at, residual, basis, groups),
     )
+
+
+def _suspect(at: Tangents, residual: Array, basis: Array, groups: Array) -> Suspect:
+    """The observation that fits worst, or the pose whose observations do as one body (a robot that had not settled)."""
+    single = worst_group(residual, basis, groups)
+    single = replace(single, observations=(single.label,))
+    twists = rigid_motions(at.data)
+    if twists is None:
+        return single
+    whole = worst_group(residual, basis, at.row_pose, at.recording.whiten(twists, at.frames))
+    if whole.log_evidence <= single.log_evidence:
+        return single
+    members = np.flatnonzero(at.recording.observations.pose == whole.label)
+    return replace(whole, observations=tuple(int(row) for row in members))
+
+
+def rigid_motions(data: ObservationData) -> Array | None:
+    """Displacements (m, 3, 6) of points by a unit shift and turn of their body; None unless poses have several."""
+    if data.kind != "points" or np.max(np.bincount(data.pose)) < 3:
+        return None
+    arm = data.p_world - data.world_T_tool[:, :3, 3]
+    turns = np.cross(np.eye(3)[None, :, :], arm[:, None, :]).swapaxes(1, 2)
+    return np.concatenate([np.broadcast_to(np.eye(3), turns.shape), turns], axis=2)
 
 
 def accepted_from(analysis: Analysis, family: int, constants: Constants) -> Accepted:

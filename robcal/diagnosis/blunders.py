@@ -15,18 +15,21 @@ BLUNDER_SIGNAL = 30.0
 
 @dataclass(frozen=True)
 class Suspect:
-    """The group of rows that fits worst: its label, log-evidence (all groups weighed in) and log-probability."""
+    """The group of rows that fits worst: its label, log-evidence (all groups weighed in) and log-probability, and the
+    observations that it stands for."""
 
     label: int
     log_evidence: float
     log_p: float
+    observations: tuple[int, ...] = ()
 
 
-def worst_group(residual: Array, fitted: Array, group: Array) -> Suspect:
+def worst_group(residual: Array, fitted: Array, group: Array, shapes: Array | None = None) -> Suspect:
     """Test of a free shift for each group of rows (a pose, or a point in a pose).
 
     The shift of a group of rows g is tested by `r_g' (I - Q_g Q_g')^-1 r_g` (Baarda's test for several gross errors).
-    `residual` (m,) whitened and projected; `fitted` (m, p) orthonormal; `group` (m,) labels.
+    `residual` (m,) whitened and projected; `fitted` (m, p) orthonormal; `group` (m,) labels; `shapes` (m, k): the ways
+    in which the rows of a group may be wrong together, each row by itself if not given.
     """
     redundancy = len(residual) - fitted.shape[1]
     total = float(residual @ residual)
@@ -40,10 +43,14 @@ def worst_group(residual: Array, fitted: Array, group: Array) -> Suspect:
     kept: list[Array] = []
     for k in range(len(labels)):
         rows = order[bounds[k] : bounds[k + 1]]
-        cofactor = np.eye(len(rows)) - fitted[rows] @ fitted[rows].T
+        near, left = fitted[rows], residual[rows]
+        if shapes is not None:
+            ways = np.linalg.qr(shapes[rows])[0]
+            near, left = ways.T @ near, ways.T @ left
+        cofactor = np.eye(len(left)) - near @ near.T
         values, vectors = np.linalg.eigh(cofactor)
         seen = values > 0.02
-        z = (vectors[:, seen].T @ residual[rows]) / np.sqrt(values[seen])
+        z = (vectors[:, seen].T @ left) / np.sqrt(values[seen])
         raw[k], used[k] = float(z @ z), int(seen.sum())
         kept.append(values[seen])
     log_p = log_f_probability(raw, used, total, redundancy)

@@ -89,7 +89,7 @@ def diagnose(
             chosen = again
         else:
             bare_model, bare = model, free
-    if chosen.accepted:
+    if chosen.accepted or chosen.blunders:
         # the first estimate contained the effects
         noise = estimate_noise(bare_model, chosen.recording, bare, chosen.accepted)
     before = fit(model, chosen.recording, free)
@@ -115,8 +115,7 @@ def diagnose(
     for finding in findings:
         if finding.rivals and not poses:
             poses = separating_poses(last.fit, chosen.recording, finding)
-    names = recording.names
-    blunders = tuple(f"{names[row]}" for _, row in chosen.blunders)
+    blunders = tuple(dict.fromkeys(chosen.recording.names[row] for _, row in chosen.blunders))
     pattern = None
     if last.p_value <= settings.level:
         family = last.families[last.top(np.ones(len(last.families), dtype=bool))]

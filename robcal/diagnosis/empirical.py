@@ -20,6 +20,9 @@ BUMPS = (4, 7, 12)
 EMPIRICAL_WEIGHT = 0.5
 """Prior weight of all empirical families together, against one for each named cause: the library holds most."""
 
+LEAST_IN_BUMP = 3
+"""Poses within `REACH` widths of the centre of a bump that stands alone."""
+REACH = 1.5
 CURVE_PRIOR = 3e-4
 """Typical amplitude of one bump of a joint's error curve, rad."""
 
@@ -41,7 +44,7 @@ def empirical_families(site: RobotSite) -> Iterator[Family]:
                 if site.varies(covariate, 1e-6):
                     families.append(_smooth(site, joint, kind, covariate))
         families.extend(_product(joint, first, second) for i, first in enumerate(joints) for second in joints[i + 1 :])
-        families.append(_bump(site, joint))
+        families.extend(bump for bump in [_bump(site, joint)] if bump.grid)
     yield from (replace(family, weight=EMPIRICAL_WEIGHT / len(families)) for family in families)
 
 
@@ -126,8 +129,15 @@ def _bump(site: RobotSite, joint: Joint) -> Family:
     k = joint.number
     values = site.variables[f"q{k}"]
     low, high = float(np.min(values)), float(np.max(values))
-    widths = [share * (high - low) for share in (0.01, 0.025, 0.05)]
-    grid = tuple({"centre": float(x), "width": w} for w in widths for x in np.arange(low, high + w, w) if w > 1e-6)
+    least = max(0.01, 1.5 / len(values))
+    widths = [share * (high - low) for share in (least, *(s for s in (0.025, 0.05) if s > 1.2 * least))]
+
+    def wide_enough(centre: float, width: float) -> bool:
+        # what shows at one or two poses is a gross error there, not a law
+        return width > 1e-6 and int(np.sum(np.abs(values - centre) < REACH * width)) >= LEAST_IN_BUMP
+
+    tried = [(float(x), w) for w in widths for x in np.arange(low, high + w, w) if wide_enough(x, w)]
+    grid = tuple({"centre": x, "width": w} for x, w in tried)
 
     def bases(c: Constants) -> tuple[Basis, ...]:
         return (Basis(joint.frame, "q", f"exp(-0.5*((q{k} - centre)/width)**2)", "c0", c),)
@@ -142,7 +152,7 @@ def _bump(site: RobotSite, joint: Joint) -> Family:
         lambda v, c: {"term": _term([f"q{k}"], "formula", _formula(bases(c), v))},
         "{where} is disturbed around one angle only (a damaged tooth, a dent)",
         grid=grid,
-        continuous={"centre": (low, high), "width": (0.003 * (high - low), 0.2 * (high - low))},
+        continuous={"centre": (low, high), "width": (least * (high - low), 0.2 * (high - low))},
         bases=bases,
         covariates=(f"q{k}",),
     )

@@ -15,6 +15,7 @@ from robcal.diagnosis.analysis import Analysis, accepted_from, analyse, extend
 from robcal.diagnosis.family_wise import FamilyWise
 from robcal.diagnosis.fitting import Accepted, Fit, fit
 from robcal.diagnosis.naming import refine
+from robcal.diagnosis.noise import estimate_noise
 from robcal.diagnosis.recording import Recording
 from robcal.diagnosis.scan import orthonormal_basis
 from robcal.physics.family import Array, Constants, Family, Key
@@ -99,7 +100,7 @@ def select(
     most_blunders = int(settings.blunder_share * len(number))
     first: Analysis | None = None
     barred: set[Key] = set()
-    settled = False
+    settled, weighed = False, True
     present = fit(model, recording, free)
     while True:
         known = level if first is None else first.family_wise
@@ -111,12 +112,18 @@ def select(
             continue
         first = first or look
         if _is_blunder(look, settings) and len(left_out) < most_blunders:
-            row = look.suspect.label
-            left_out.append((int(number[row]), int(recording.observations.pose[row])))
-            number = np.delete(number, row)
-            recording = recording.without_observations(np.array([row]))
+            rows = list(look.suspect.observations)
+            left_out.extend((int(number[row]), int(recording.observations.pose[row])) for row in rows)
+            number = np.delete(number, rows)
+            recording = recording.without_observations(np.array(rows))
             first = None if not accepted else first
-            present = fit(model, recording, free, accepted)
+            present, weighed = fit(model, recording, free, accepted), False
+            continue
+        if not weighed:
+            # gross errors looked like scatter of the joints
+            recording = estimate_noise(model, recording, free, accepted).apply(recording)
+            first = None if not accepted else first
+            present, weighed = fit(model, recording, free, accepted), True
             continue
         trial = None
         if look.p_value <= _level(look, accepted, settings) and len(accepted) < settings.most:

@@ -7,8 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robcal.diagnosis.empirical import empirical_families
+from robcal.diagnosis.empirical import LEAST_IN_BUMP, REACH, empirical_families
 from robcal.physics.family import Family
+from robcal.physics.site import RobotSite
+from robcal.robot.model import Frame, RobotModel
 from robcal.robot.terms import evaluate
 from tests.physics.test_families import site
 
@@ -40,3 +42,17 @@ def test_all_of_them_share_one_weight() -> None:
     assert {f.cause for f in families} == {"unknown"}
     assert sum(f.weight for f in families) == pytest.approx(families[0].weight * len(families))
     assert sum(f.weight for f in families) < 1.0
+
+
+def test_a_bump_that_stands_alone_is_seen_at_several_poses() -> None:
+    frames = (Frame("axis1", "z", xyz=(0.0, 0.0, 0.5)), Frame("axis2", "y", xyz=(0.3, 0.0, 0.0)))
+    rng = np.random.default_rng(2)
+    angles = {"q1": rng.normal(size=80), "q2": np.append(rng.uniform(-0.1, 0.1, 79), 3.0)}
+    where = RobotSite(RobotModel("two", frames), angles | {"index": np.arange(80.0)}, frozenset(), frozenset())
+    bumps = [family for family in empirical_families(where) if "width" in family.continuous]
+    assert {family.where for family in bumps} == {"axis1", "axis2"}
+    for family in bumps:
+        values = angles[family.covariates[0]]
+        for point in family.grid:
+            near = np.abs(values - point["centre"]) < REACH * point["width"]
+            assert near.sum() >= LEAST_IN_BUMP

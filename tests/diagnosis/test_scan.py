@@ -76,6 +76,19 @@ def test_gross_error_is_found_in_its_group() -> None:
     assert suspect.log_evidence > 20
 
 
+def test_gross_error_of_a_whole_body_is_seen_in_the_ways_in_which_it_moves() -> None:
+    rng = np.random.default_rng(6)
+    basis = orthonormal_basis(rng.normal(size=(ROWS, PARAMETERS)))
+    ways = rng.normal(size=(ROWS, 2))
+    noise = rng.normal(size=ROWS)
+    noise[24:36] += 4.0 * ways[24:36] @ np.array([0.8, -0.6])
+    r = remove(basis, noise[:, None])[:, 0]
+    group = np.repeat(np.arange(ROWS // 12), 12)
+    together = worst_group(r, basis, group, ways[: len(group)])
+    assert together.label == 2
+    assert together.log_evidence > worst_group(r, basis, group).log_evidence + 5
+
+
 def test_a_preferred_sign_shares_out_the_same_evidence() -> None:
     singular, z = np.full((2, 1), 5.0), np.array([[4.0], [-4.0]])
     plain = log_bayes_factor(singular, z)
