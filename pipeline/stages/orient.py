@@ -32,6 +32,7 @@ from robcal.photogrammetry.camera import INTRINSIC_NAMES, Camera
 from robcal.photogrammetry.identify_station import identify_station
 from robcal.photogrammetry.measure_points import measure_points
 from robcal.photogrammetry.measured_points import MeasuredPoints
+from robcal.photogrammetry.seen_normals import ellipses_of, needs_normals, with_seen_normals
 from robcal.photogrammetry.station import orient_station
 from robcal.photogrammetry.station_network import StationMarks, StationOrientation, StationSettings
 
@@ -49,7 +50,8 @@ def work(context: Context) -> Outcome:
     start: dict[str, Camera | None] = {
         name: source.start.camera if source.start else None for name, source in campaign.cameras.items()
     }
-    marks, problems = _marks(campaign, run, body, poses, start)
+    detections = _detections(campaign, run, poses)
+    marks, problems = _marks(campaign, detections, body, poses, start)
     notes = _problem_notes(problems, poses)
     marks = _usable(campaign, marks, body, notes, problems)
     stated = {
@@ -68,9 +70,12 @@ def work(context: Context) -> Outcome:
         return station_data(orientation, poses.names, body, start, image_covariates(campaign))
 
     try:
+        if needs_normals(body):
+            ellipses = {name: ellipses_of(m, detections[name]) for name, m in marks.items() if name in detections}
+            carried = with_seen_normals(body, orient(StationSettings(detect_moves=False)), marks, ellipses)
         sized: tuple[ImageFinding, ...] = ()
         if campaign.entry.diagnosis.enabled:
-            carried, sized = with_dot_sizes(body, lambda: data(orient(StationSettings())))
+            carried, sized = with_dot_sizes(carried, lambda: data(orient(StationSettings())))
             orientation, again = with_small_moves(orient, data)
             if campaign.robot is not None:
                 orientation = which_moved(orientation, again, lambda tried: robot_misfit(campaign, tried, marks))
@@ -96,22 +101,29 @@ def _check_body(campaign: Campaign, body: Body, name: str) -> None:
         )
 
 
+def _detections(campaign: Campaign, run: Run, poses: Poses) -> dict[str, dict[int, Detections]]:
+    """Camera -> pose number -> what was detected in its image."""
+    if not any(source.images for source in campaign.cameras.values()):
+        return {}
+    place = {name: i for i, name in enumerate(poses.names)}
+    index: DetectionIndex = run.load("detect")
+    return {
+        name: {place[image]: found for image, found in load_detections(run, index, f"station/{name}").items()}
+        for name, source in campaign.cameras.items()
+        if source.images
+    }
+
+
 def _marks(
-    campaign: Campaign, run: Run, body: Body, poses: Poses, start: Mapping[str, Camera | None]
-) -> tuple[dict[str, StationMarks], tuple[tuple[str, int, str], ...]]:
+    campaign: Campaign, detections: Mapping[str, Mapping[int, Detections]], body: Body, poses: Poses,
+    start: Mapping[str, Camera | None],
+) -> tuple[dict[str, StationMarks], tuple[tuple[str, int, str], ...]]:  # fmt: skip
     place = {name: i for i, name in enumerate(poses.names)}
     given = {
         name: _from_table(source.marks, body, place)
         for name, source in campaign.cameras.items()
         if source.marks is not None
     }
-    detections: dict[str, dict[int, Detections]] = {}
-    if any(source.images for source in campaign.cameras.values()):
-        index: DetectionIndex = run.load("detect")
-        for name, source in campaign.cameras.items():
-            if source.images:
-                found = load_detections(run, index, f"station/{name}")
-                detections[name] = {place[image]: targets for image, targets in found.items()}
     if not detections:
         return given, ()
     identified = identify_station(detections, body, start)
