@@ -23,6 +23,8 @@ EMPIRICAL_WEIGHT = 0.5
 LEAST_IN_BUMP = 3
 """Poses within `REACH` widths of the centre of a bump that stands alone."""
 REACH = 1.5
+SLACK = (0.15, 0.4, 0.65)
+"""Shares of half a joint's range within which a cable hangs slack."""
 CURVE_PRIOR = 3e-4
 """Typical amplitude of one bump of a joint's error curve, rad."""
 
@@ -45,6 +47,7 @@ def empirical_families(site: RobotSite) -> Iterator[Family]:
                     families.append(_smooth(site, joint, kind, covariate))
         families.extend(_product(joint, first, second) for i, first in enumerate(joints) for second in joints[i + 1 :])
         families.extend(bump for bump in [_bump(site, joint)] if bump.grid)
+        families.extend(_taut(site, joint, other) for other in joints if other.number != joint.number)
     yield from (replace(family, weight=EMPIRICAL_WEIGHT / len(families)) for family in families)
 
 
@@ -155,6 +158,37 @@ def _bump(site: RobotSite, joint: Joint) -> Family:
         continuous={"centre": (low, high), "width": (least * (high - low), 0.2 * (high - low))},
         bases=bases,
         covariates=(f"q{k}",),
+    )
+
+
+def _taut(site: RobotSite, joint: Joint, other: Joint) -> Family:
+    """Nothing until another joint has gone so far to either side, then a pull that grows: hoses and cables."""
+    name = f"q{other.number}"
+    values = site.variables[name]
+    low, high = float(np.min(values)), float(np.max(values))
+    middle, half = 0.5 * (low + high), 0.5 * (high - low)
+
+    def bases(c: Constants) -> tuple[Basis, ...]:
+        ends = {"low": low, "high": high, **c}
+        held = f"minimum(maximum({name}, low), high)"
+        return (
+            Basis(joint.frame, "q", f"maximum(0.0, {held} - above)", "c0", ends),
+            Basis(joint.frame, "q", f"maximum(0.0, below - {held})", "c1", ends),
+        )
+
+    return Family(
+        "unknown",
+        "robot",
+        joint.where,
+        _place(joint, "q"),
+        (),
+        (),
+        lambda v, c: {"term": _term([name], "formula", _formula(bases(c), v))},
+        "Something the library has no name for pulls at {where} once axis " + f"{other.number} has gone far",
+        grid=tuple({"above": middle + share * half, "below": middle - share * half} for share in SLACK),
+        bases=bases,
+        covariates=(name,),
+        default_prior=CURVE_PRIOR / max(half, 1e-9),
     )
 
 

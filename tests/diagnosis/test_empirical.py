@@ -56,3 +56,17 @@ def test_a_bump_that_stands_alone_is_seen_at_several_poses() -> None:
         for point in family.grid:
             near = np.abs(values - point["centre"]) < REACH * point["width"]
             assert near.sum() >= LEAST_IN_BUMP
+
+
+def test_a_cable_pulls_only_beyond_its_slack() -> None:
+    taut = [f for f in empirical_families(site()) if "pulls at" in f.sentence]
+    assert {(f.where, f.covariates) for f in taut} == {("axis1", ("q2",)), ("axis2", ("q1",))}
+    values = np.asarray(site().variables["q2"])
+    for constants in taut[0].grid:
+        first, second = taut[0].bases(constants)  # type: ignore[misc]
+        inside = np.linspace(constants["below"], constants["above"], 20)
+        assert not np.any(first.value({"q2": inside})) and not np.any(second.value({"q2": inside}))
+        ends = {"q2": np.array([values.min(), values.max(), values.max() + 1.0])}
+        pull = first.value(ends)
+        assert pull[0] == 0.0 < pull[1] == pull[2]
+        assert second.value(ends)[0] > 0.0
