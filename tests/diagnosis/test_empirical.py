@@ -65,7 +65,8 @@ def test_a_cable_pulls_only_beyond_its_slack() -> None:
     for constants in taut[0].grid:
         first, second = taut[0].bases(constants)  # type: ignore[misc]
         inside = np.linspace(constants["below"], constants["above"], 20)
-        assert not np.any(first.value({"q2": inside})) and not np.any(second.value({"q2": inside}))
+        assert not np.any(first.value({"q2": inside}))
+        assert not np.any(second.value({"q2": inside}))
         ends = {"q2": np.array([values.min(), values.max(), values.max() + 1.0])}
         pull = first.value(ends)
         assert pull[0] == 0.0 < pull[1] == pull[2]
