@@ -18,6 +18,7 @@ from robcal.diagnosis.noise import estimate_noise
 from robcal.diagnosis.recording import Recording, observation_data
 from robcal.diagnosis.region import region_errors
 from robcal.diagnosis.result import Diagnosis, Finding, Rival
+from robcal.diagnosis.scan import orthonormal_basis
 from robcal.diagnosis.selection import (
     Selection,
     SelectionSettings,
@@ -276,28 +277,30 @@ def _square(fitted: Fit) -> float:
     return float(fitted.residual @ fitted.residual)
 
 
-def _covariance(look: Analysis, item: Accepted, held: Iterable[str]) -> Array:
-    """Covariance of the amplitudes in units of the variance factor.
+def _covariance(last: Analysis, item: Accepted, held: Iterable[str]) -> Array:
+    """Covariance of the amplitudes in units of the variance factor, where the last fit ended.
 
     The uncertainty of constants that were refined along with them is included, and what the parameters add that the
     identification holds at nominal values because the data hardly tell them: they are as random as robots are.
     """
-    family = item.family
-    columns = [look.at.columns(family, item.constants)]
+    family, at, fitted = item.family, last.at, last.fit
+    own = fitted.columns_of(item)
+    columns = [fitted.jacobian[:, own]]
     for name in [name for name in family.continuous if np.isfinite(item.constants.get(name, np.inf))]:
         low, high = family.continuous[name]
         step = 1e-3 * (abs(item.constants[name]) if low > 0 else high - low)
         ends = [dict(item.constants) | {name: item.constants[name] + side * step} for side in (1.0, -1.0)]
-        ahead, behind = (look.at.columns(family, end) @ item.values for end in ends)
+        ahead, behind = (at.columns(family, end) @ item.values for end in ends)
         columns.append(((ahead - behind) / (2.0 * step))[:, None])
     together = np.column_stack(columns)
-    seen = together - look.basis @ (look.basis.T @ together)
+    basis = orthonormal_basis(np.delete(fitted.jacobian, own, axis=1))
+    seen = together - basis @ (basis.T @ together)
     cofactor = pseudo_covariance(seen)
-    sizes = {name: usual_size(name, look.at.variables) for name in held if name in look.at.parameters}
-    moved = [look.at.parameters[name] * size for name, size in sizes.items() if size > 0]
+    sizes = {name: usual_size(name, at.variables) for name in held if name in at.parameters}
+    moved = [at.parameters[name] * size for name, size in sizes.items() if size > 0]
     if moved:
         pulled = cofactor @ (seen.T @ np.stack(moved, axis=1))
-        cofactor = cofactor + pulled @ pulled.T / max(look.result.variance_factor, 1e-300)
+        cofactor = cofactor + pulled @ pulled.T / max(fitted.variance_factor, 1e-300)
     count = len(item.values)
     return cofactor[:count, :count]
 
@@ -337,9 +340,9 @@ def _finding(
         evidence = float(look.ranked.log_weight[named] - np.log(family.weight))
         if family.cause != "unknown":
             others = rivals(look.families, named, look.ranked, look.stacks, projected, look.named & look.significant())
-    factor = look.result.variance_factor
-    covariance = _covariance(look, item, chosen.tied) * factor
     final = chosen.last.fit
+    factor = final.variance_factor
+    covariance = _covariance(chosen.last, item, chosen.tied) * factor
     values, spread = told_through(final, item, covariance, factor)
     told, sigma = numeric_sigma(family.report, values, item.constants, spread)
     for name, (parameter, unit) in family.beside.items():

@@ -75,6 +75,15 @@ class Fit:
     prior_residual: Array
     common: Array | None = None
 
+    def columns_of(self, item: Accepted) -> Array:
+        """Columns of `jacobian` that belong to the amplitudes of one of the accepted causes."""
+        number = next(k for k, other in enumerate(self.accepted) if other is item)
+        if item.family.displace is None:
+            short = (f"{item.family.where}_{item.family.cause}_{number}.{name}" for name in item.names)
+            return np.array([self.free.index(name) for name in item.family.frees or short], dtype=np.intp)
+        before = [len(other.names) for other in self.accepted[:number] if other.family.displace is not None]
+        return np.arange(len(item.names), dtype=np.intp) + len(self.free) + sum(before)
+
     @property
     def redundancy(self) -> int:
         """Observations less parameters."""

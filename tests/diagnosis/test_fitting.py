@@ -34,3 +34,6 @@ def test_a_displacement_that_the_robot_nearly_absorbs_is_followed_all_the_way(
     told = fit(imitation.model, offset, found.names, (accepted,))
     assert abs(told.accepted[0].values[0] - 0.2) < 4 * float(np.sqrt(told.accepted[0].covariance[0, 0]))
     assert rms(position_errors(offset, told)) < 1.01 * rms(position_errors(identify, plain))
+    own = told.columns_of(told.accepted[0])
+    assert np.array_equal(told.covariance[np.ix_(own, own)], told.accepted[0].covariance)
+    assert told.jacobian[:, own].shape == (len(told.residual), 1)
