@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,12 +19,15 @@ from robcal.diagnosis.image_station import given_points, station_data
 from robcal.diagnosis.lens_findings import beyond_lenses, station_findings, survey_findings
 from robcal.diagnosis.scale_findings import scale_findings
 from robcal.photogrammetry.camera import Camera
+from robcal.photogrammetry.seen_normals import Ellipses
 from robcal.photogrammetry.station_network import StationMarks, StationOrientation
 from robcal.photogrammetry.survey_types import SurveyResult
 from robcal.transforms import Array
 
-DOT_SIZES = "dot_sizes"
-"""Artifact of the station: diameters of dots that its images show and no file states."""
+SHAPES = "shapes"
+"""Artifact of the station: ellipses and light of its identified marks."""
+TAKEN_BACK = "taken_back"
+"""Artifact of the station: findings that it was oriented without (sizes of dots, centres that lag behind light)."""
 
 
 @dataclass(frozen=True)
@@ -65,12 +68,14 @@ def images_of(campaign: Campaign, run: Run) -> ImageFindings:
         names: Sequence[str] = campaign.poses.names if campaign.poses is not None else ()
         given = surveyed_or_given(campaign, run, orientation.body.name)
         files = {camera: s.start.camera if s.start else None for camera, s in campaign.cameras.items()}
-        data = station_data(orientation, tuple(names), given, files, image_covariates(campaign))
         marks: dict[str, StationMarks] = run.load("marks")
+        shapes: dict[str, Ellipses] = run.load(SHAPES) if run.has(SHAPES) else {}
+        data = station_data(orientation, tuple(names), given, files, image_covariates(campaign))
+        data = replace(data, light=light_of(orientation, marks, shapes))
         swapped = exchanged_targets(orientation, marks, given)
         explained = frozenset(str(name) for f in swapped for name in (f.where, f.parameters["with"]))
         stated = given_points(orientation, given)
-        taken_back = tuple(run.load(DOT_SIZES)) if run.has(DOT_SIZES) else ()
+        taken_back = tuple(run.load(TAKEN_BACK)) if run.has(TAKEN_BACK) else ()
         findings += [*taken_back, *swapped]
         findings += station_findings(orientation, tuple(names), stated, data.inflation, explained)
         scans.append(diagnose_images(data))
@@ -79,6 +84,22 @@ def images_of(campaign: Campaign, run: Run) -> ImageFindings:
     for scan in scans:
         findings += scan.findings
     return ImageFindings(beyond_lenses(findings, cameras), tuple(scans), max(noise), taken_back)
+
+
+def light_of(
+    orientation: StationOrientation, marks: Mapping[str, StationMarks], shapes: Mapping[str, Ellipses]
+) -> Array | None:
+    """Light (m,) of the marks that a station was adjusted with; None where no images were read."""
+    if not shapes:
+        return None
+    known = {
+        (name, int(pose), int(target)): float(light)
+        for name, shape in shapes.items()
+        for pose, target, light in zip(marks[name].pose, marks[name].target, shape.light, strict=True)
+    }
+    m = orientation.marks
+    keys = zip(m.camera, orientation.poses[m.pose], orientation.body.ids[m.target], strict=True)
+    return np.array([known.get((orientation.names[c], int(p), int(t)), np.nan) for c, p, t in keys])
 
 
 def image_covariates(campaign: Campaign) -> Mapping[str, Array]:

@@ -21,7 +21,7 @@ from fixtures.own_station import OwnPlan
 
 SNRS = (12.0, 30.0)
 SPOILT: tuple[tuple[str, Spoil], ...] = (
-    ("left/p003", "black"), ("right/p005", "truncated"), ("left/p008", "blurred"), ("right/p010", "other"),
+    ("left/p003", "black"), ("right/p005", "white"), ("left/p008", "blurred"), ("right/p010", "other"),
 )  # fmt: skip
 NULLS: Mapping[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "plain": ({}, {}),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import numpy as np
 from pipeline.bodies import surveyed_or_given
 from pipeline.camera_file import CameraFile, write_camera
 from pipeline.campaign import Campaign, ImageSource
-from pipeline.image_findings import DOT_SIZES, image_covariates
+from pipeline.image_findings import SHAPES, TAKEN_BACK, image_covariates, light_of
 from pipeline.measurement_tables import MarksTable
 from pipeline.moved_cameras import robot_misfit
 from pipeline.poses_table import Poses
@@ -25,6 +26,7 @@ from robcal.diagnosis.dot_sizes import with_dot_sizes
 from robcal.diagnosis.image_data import ImageData
 from robcal.diagnosis.image_diagnosis import ImageFinding
 from robcal.diagnosis.image_station import station_data
+from robcal.diagnosis.light_lag import without_lag
 from robcal.errors import InvalidInput, RobcalError
 from robcal.imaging.detections import Detections
 from robcal.photogrammetry.bodies import Body
@@ -62,20 +64,29 @@ def work(context: Context) -> Outcome:
     sizes = {name: _size(campaign.cameras[name], run, name) for name in marks}
 
     carried = body
+    at_first: list[StationOrientation] = []
+    shapes = {name: ellipses_of(m, detections[name]) for name, m in marks.items() if name in detections}
 
     def orient(settings: StationSettings) -> StationOrientation:
+        if at_first and settings == StationSettings():
+            return at_first[0]
         return orient_station(marks, carried, {n: start[n] for n in marks}, sizes, stated, settings)
 
     def data(orientation: StationOrientation) -> ImageData:
-        return station_data(orientation, poses.names, body, start, image_covariates(campaign))
+        view = station_data(orientation, poses.names, body, start, image_covariates(campaign))
+        return replace(view, light=light_of(orientation, marks, shapes))
 
     try:
         if needs_normals(body):
-            ellipses = {name: ellipses_of(m, detections[name]) for name, m in marks.items() if name in detections}
-            carried = with_seen_normals(body, orient(StationSettings(detect_moves=False)), marks, ellipses)
-        sized: tuple[ImageFinding, ...] = ()
+            carried = with_seen_normals(body, orient(StationSettings(detect_moves=False)), marks, shapes)
+        taken: tuple[ImageFinding, ...] = ()
         if campaign.entry.diagnosis.enabled:
-            carried, sized = with_dot_sizes(carried, lambda: data(orient(StationSettings())))
+            carried, taken = with_dot_sizes(carried, lambda: data(orient(StationSettings())))
+            at_first.append(orient(StationSettings()))
+            marks, lags = without_lag(marks, shapes, lambda: data(at_first[0]))
+            if lags:
+                taken = (*taken, *lags)
+                at_first.clear()
             orientation, again = with_small_moves(orient, data)
             if campaign.robot is not None:
                 orientation = which_moved(orientation, again, lambda tried: robot_misfit(campaign, tried, marks))
@@ -83,9 +94,10 @@ def work(context: Context) -> Outcome:
             orientation = orient(StationSettings())
     except RobcalError as error:
         raise located(error, f"{campaign.path}: station") from None
-    outputs = [run.save(NAME, orientation), run.save("marks", marks), run.save(DOT_SIZES, list(sized))]
+    outputs = [run.save(NAME, orientation), run.save("marks", marks), run.save(TAKEN_BACK, list(taken))]
+    outputs.append(run.save(SHAPES, shapes))
     outputs += _write_cameras(campaign, run, orientation)
-    notes += [f.statement for f in sized] + [e.statement for e in orientation.evidence]
+    notes += [f.statement for f in taken] + [e.statement for e in orientation.evidence]
     whole = [r for r in orientation.rejected if r.target < 0]
     notes += [f"camera {r.camera}, pose '{poses.names[r.pose]}': {r.reason}" for r in whole]
     return Outcome({"station": _result(orientation, marks)}, outputs, notes)

@@ -19,6 +19,8 @@ from robcal.physics.family import Array
 DEG = float(np.degrees(1.0))
 FIELD_DEGREE = 5
 MOST_CHANGE_POINTS = 40
+LEAST_LIGHT = 0.02
+"""Scatter of the dots' light below which nothing can be said of its influence."""
 
 
 def image_causes(data: ImageData, moves: bool = True) -> Iterator[ImageCause]:
@@ -29,6 +31,7 @@ def image_causes(data: ImageData, moves: bool = True) -> Iterator[ImageCause]:
             yield from _lens(data, c, name, rows)
             yield from refraction_causes(data, c, name, rows)
             yield from _bias(data, name, rows)
+            yield from _lag(data, name, rows)
             yield _field(data, c, name, rows)
             if moves and data.by_exterior is not None:
                 yield from _moves(data, name, rows)
@@ -130,6 +133,31 @@ def _bias(data: ImageData, name: str, rows: Array) -> Iterator[ImageCause]:
         np.array([0.1]),
         lambda v: {"px": float(v[0])},
         "Centres of tilted dots in {where} are displaced along their tilt, by {px:.3f} px at a right angle",
+        weight=0.3,
+        bends=True,
+    )
+
+
+def _lag(data: ImageData, name: str, rows: Array) -> Iterator[ImageCause]:
+    """Centres displaced by so much times their light: charge that lags behind on read-out, light that spills over.
+
+    Weakness: only what differs between the marks of an image, or from image to image, can be seen.
+    """
+    if data.light is None or not data.dots:
+        return
+    light = data.light[rows]
+    if np.count_nonzero(np.isfinite(light)) < 10 or np.nanstd(light) < LEAST_LIGHT:
+        return
+    columns = np.nan_to_num(data.light)[:, None, None] * np.eye(2)
+    yield ImageCause(
+        "centroid_bias",
+        "image",
+        name,
+        None,
+        only(rows, columns),
+        np.array([0.2, 0.2]),
+        lambda v: {"px": float(np.hypot(*v)), "by_light_px": [float(x) for x in v]},
+        "Centres of bright dots in {where} lag behind their light, by {px:.3f} px where a dot is as bright as can be",
         weight=0.3,
         bends=True,
     )

@@ -38,7 +38,8 @@ class ImageData:
     free : per camera the numbers of the interior orientation whose lack is no cause: adjusted ones, and all where no
         file states any (`f_only`: fx and fy change alike).
     radii : (m,) m of the dots as modelled, 0 where the eccentricity is not. dots : whether the targets are round dots.
-    sigma_px : typical standard deviation of a coordinate.
+    sigma_px : typical standard deviation of a coordinate. light : (m,) of the dots, 1 at the sensor's largest number;
+        NaN where unknown.
     covariates : per mark, change since the first pose: `temp_<place>_c` in K, `hours` in h.
     inflation : cause -> factor by which the scores of such candidates scatter more than the marks' noise says.
     """
@@ -68,6 +69,7 @@ class ImageData:
     dots: bool = True
     covariates: Mapping[str, Array] = field(default_factory=dict)
     inflation: Mapping[str, float] = field(default_factory=dict)
+    light: Array | None = None
 
 
 def survey_data(

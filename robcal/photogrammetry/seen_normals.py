@@ -23,22 +23,26 @@ SURE = np.radians(2.0)
 
 @dataclass(frozen=True)
 class Ellipses:
-    """Shapes of one camera's marks: ``semi_axes`` (m, 2) px, major first, ``angle`` (m,) rad; NaN where unknown."""
+    """Shapes of one camera's marks: ``semi_axes`` (m, 2) px, major first, ``angle`` (m,) rad; ``light`` (m,) by the
+    largest number of the image's type; NaN where unknown."""
 
     semi_axes: Array
     angle: Array
+    light: Array
 
 
 def ellipses_of(marks: StationMarks, detections: Mapping[int, Detections]) -> Ellipses:
     """The ellipses of identified marks, from the detections (by pose) that they were taken from."""
     axes, angle = np.full((len(marks), 2), np.nan), np.full(len(marks), np.nan)
+    contrast = np.full(len(marks), np.nan)
     for pose, found in detections.items():
         row_of = {tuple(xy): row for row, xy in enumerate(found.xy.tolist())}
         for i in np.flatnonzero(marks.pose == pose):
             row = row_of.get(tuple(marks.xy[i].tolist()))
             if row is not None:
-                axes[i], angle[i] = found.semi_axes[row], found.angle[row]
-    return Ellipses(axes, angle)
+                axes[i], angle[i], contrast[i] = found.semi_axes[row], found.angle[row], abs(found.contrast[row])
+    top = 255.0 if not np.nanmax(contrast, initial=0.0) > 255.0 else 65535.0
+    return Ellipses(axes, angle, contrast / top)
 
 
 def needs_normals(body: Body) -> bool:

@@ -29,7 +29,8 @@ def scene() -> tuple[Station, StationOrientation, dict[str, Ellipses]]:
         shapes = [
             polygon_axes(disc_outline(s.cameras[name], a, b, DIAMETER / 2, 60)) for a, b in zip(p, n, strict=True)
         ]
-        ellipses[name] = Ellipses(np.array([axes for axes, _ in shapes]), np.array([angle for _, angle in shapes]))
+        axes, angle = (np.array(column) for column in zip(*shapes, strict=True))
+        ellipses[name] = Ellipses(axes, angle, np.zeros(len(m)))
     return s, orient_station(s.marks, s.body, s.rough, s.sizes), ellipses
 
 
@@ -48,7 +49,7 @@ def test_dots_at_different_heights_get_their_directions(
 
 def test_nothing_is_made_up(scene: tuple[Station, StationOrientation, dict[str, Ellipses]]) -> None:
     s, orientation, ellipses = scene
-    blind = {n: Ellipses(np.full_like(e.semi_axes, np.nan), e.angle) for n, e in ellipses.items()}
+    blind = {n: replace(e, semi_axes=np.full_like(e.semi_axes, np.nan)) for n, e in ellipses.items()}
     assert with_seen_normals(s.body, orientation, s.marks, blind) is s.body
     assert with_seen_normals(s.body, orientation, s.marks, {}) is s.body
     flat = simulate(seed=3, poses=3)
@@ -63,10 +64,13 @@ def test_ellipses_are_those_of_the_marks() -> None:
         xy = np.array([[10.0, 20.0], [30.0, 40.0]])
         semi_axes = np.array([[3.0, 2.0], [5.0, 4.0]])
         angle = np.array([0.1, 0.2])
+        contrast = np.array([51.0, -102.0])
 
     two = np.tile(np.eye(2), (2, 1, 1))
     marks = StationMarks(np.array([4, 5]), np.array([1, 2]), np.array([[30.0, 40.0], [10.0, 20.0]]), two)
     shapes = ellipses_of(marks, {4: Found()})  # type: ignore[dict-item]
     np.testing.assert_array_equal(shapes.semi_axes[0], [5.0, 4.0])
     assert shapes.angle[0] == 0.2
+    assert shapes.light[0] == pytest.approx(0.4)
+    assert np.isnan(shapes.light[1])
     assert np.isnan(shapes.semi_axes[1]).all()
