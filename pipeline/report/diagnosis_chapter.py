@@ -18,6 +18,8 @@ from robcal.photogrammetry.camera import Camera
 from robcal.transforms import Array
 
 LEVEL = 0.01
+LONGEST_FORMULA = 100
+LAWS = {"gaussian_process": "smooth law", "spline": "smooth law", "harmonic": "harmonics"}
 _NAMES = {
     "joint_compliance": "elasticity about the joint's own axis",
     "link_compliance": "elasticity across the joint's axis",
@@ -137,7 +139,11 @@ def _parameter(name: str, value: Any, sigma: Any) -> str:
             shown, unit = name.removesuffix(suffix).replace("_", " ") or "amount", f" {told}"
             break
     if isinstance(value, dict):
-        return f"{shown}: {value.get('formula') or value.get('kind') or value}"
+        formula = str(value.get("formula") or value.get("kind") or value)
+        if len(formula) <= LONGEST_FORMULA:
+            return f"{shown}: {formula}"
+        variables = ", ".join(map(str, value.get("variables") or ()))
+        return f"{LAWS.get(str(value.get('kind')), 'law')} of {variables} (formula in diagnosis.json)"
     if isinstance(value, list):
         spread = sigma if isinstance(sigma, list) else [None] * len(value)
         return f"{shown} " + ", ".join(_with_sigma(v, s) for v, s in zip(value, spread, strict=False)) + unit

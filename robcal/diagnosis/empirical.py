@@ -64,6 +64,20 @@ def _formula(bases: tuple[Basis, ...], values: Array) -> str:
     return " + ".join(f"{value:.6g}*({b.expression})" for b, value in zip(bases, values, strict=True))
 
 
+def spoken(covariate: str) -> str:
+    """A covariate in words."""
+    if covariate in ("time_s", "index"):
+        return "time" if covariate == "time_s" else "the order of the poses"
+    if covariate.startswith("temp_"):
+        return f"the temperature '{covariate.removeprefix('temp_').removesuffix('_c')}'"
+    for start, words in (("torque", "the load torque of axis {}"), ("q", "the angle of axis {}")):
+        number = covariate.removeprefix(start)
+        if covariate.startswith(start) and number.isdigit():
+            return words.format(number)
+    frame, _, angle = covariate.rpartition("_m")
+    return f"the moment about {LETTER_OF_KIND[angle]} of {frame}" if angle in LETTER_OF_KIND else covariate
+
+
 def _smooth(site: RobotSite, joint: Joint, kind: str, covariate: str) -> Family:
     """A smooth law of a covariate; beyond the values recorded it stays as at their end."""
     values = site.variables[covariate]
@@ -96,7 +110,7 @@ def _smooth(site: RobotSite, joint: Joint, kind: str, covariate: str) -> Family:
         (),
         (),
         report,
-        "Something the library has no name for acts on {where} and follows " + covariate,
+        "Something the library has no name for acts on {where} and follows " + spoken(covariate),
         grid=tuple({"bumps": float(n)} for n in BUMPS),
         bases=bases,
         covariates=(covariate,),
@@ -121,7 +135,7 @@ def _product(joint: Joint, first: Joint, second: Joint) -> Family:
         (),
         (),
         lambda v, c: {"term": _term([a, b], "harmonic", _formula(bases(c), v))},
-        f"Something the library has no name for acts on {{where}} and follows {a} together with {b}",
+        f"Something the library has no name for acts on {{where}} and follows {spoken(a)} together with {spoken(b)}",
         grid=tuple({"first_order": n, "second_order": m} for n in (1.0, 2.0) for m in (1.0, 2.0)),
         bases=bases,
         covariates=(a, b),

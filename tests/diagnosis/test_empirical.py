@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robcal.diagnosis.empirical import LEAST_IN_BUMP, REACH, empirical_families
+from robcal.diagnosis.empirical import LEAST_IN_BUMP, REACH, empirical_families, spoken
 from robcal.physics.family import Family
 from robcal.physics.site import RobotSite
 from robcal.robot.model import Frame, RobotModel
@@ -71,3 +71,19 @@ def test_a_cable_pulls_only_beyond_its_slack() -> None:
         pull = first.value(ends)
         assert pull[0] == 0.0 < pull[1] == pull[2]
         assert second.value(ends)[0] > 0.0
+
+
+@pytest.mark.parametrize(
+    ("covariate", "words"),
+    [
+        ("q5", "the angle of axis 5"),
+        ("torque12", "the load torque of axis 12"),
+        ("axis3_mroll", "the moment about x of axis3"),
+        ("temp_room_c", "the temperature 'room'"),
+        ("time_s", "time"),
+        ("index", "the order of the poses"),
+        ("humidity", "humidity"),
+    ],
+)
+def test_covariates_are_told_in_words(covariate: str, words: str) -> None:
+    assert spoken(covariate) == words
