@@ -216,17 +216,18 @@ def _gain(material: Material, d: Mapping[str, Any]) -> list[Block]:
     floor = held.get("noise_floor")
     before, after = number(held.get("before")), number(held.get("after"))
     what = "error of single measured points" if unit == "mm" and _on_points(material) else "error"
-    text = f"On {kept} the {what} is {before} {unit} (RMS) before and {after} after"
+    same = _same(held)  # what was found lies in the images, and the measured poses are freed of it already
+    text = f"On {kept} the {what} is {before} {unit} (RMS)" + ("" if same else f" before and {after} after")
     text += f"; the noise of the measurement alone gives {number(floor)} {unit}." if floor else "."
     region = held.get("region")
-    if region and d.get("mismatch"):
+    if region and d.get("mismatch") and not same:
         text += (
             f" At one end of the measured space, predicted from all other poses, it is {number(region.get('before'))} "
             f"{unit} before and {number(region.get('after'))} after: what parameters absorb shows there first."
         )
     blocks: list[Block] = [Text(text)]
     evidence = material.evidence
-    if evidence and d.get("mismatch") and len(evidence.poses):
+    if evidence and d.get("mismatch") and len(evidence.poses) and not same:
         order = np.argsort(-evidence.before, kind="stable")[:80]
         names = [label(evidence.poses[i]) for i in order]
         data = tuple(
@@ -246,6 +247,12 @@ def _gain(material: Material, d: Mapping[str, Any]) -> list[Block]:
                    "Errors of kept-out poses before and after the diagnosis", height=300)
         )  # fmt: skip
     return blocks
+
+
+def _same(held: Mapping[str, Any]) -> bool:
+    """Whether the errors before and after are equal."""
+    before, after = held.get("before"), held.get("after")
+    return before is not None and after is not None and abs(before - after) <= 1e-6 * abs(before)
 
 
 def _on_points(material: Material) -> bool:

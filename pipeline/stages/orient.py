@@ -251,6 +251,7 @@ STAGE = Stage(
         "robcal/robot",
         "robcal/least_squares.py",
         "robcal/transforms.py",
+        "pipeline/image_findings.py",
         "pipeline/moved_cameras.py",
         "pipeline/stages/observations.py",
         "pipeline/stages/orient.py",

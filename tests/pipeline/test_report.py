@@ -7,6 +7,8 @@ import re
 import shutil
 from html.parser import HTMLParser
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ import pytest
 from fixtures.campaigns import make_campaign
 from pipeline.report import write_report
 from pipeline.report.blocks import Figure
+from pipeline.report.diagnosis_chapter import _gain
 from pipeline.report.style import label, number, probability
 from pipeline.runner import run_campaign
 from pipeline.runs import Run, open_run
@@ -187,3 +190,12 @@ def test_words_for_plots_and_probabilities() -> None:
     assert label("<b>") == "&lt;b&gt;"
     assert probability(1e-30) == "below 1e-12"
     assert probability(0.034) == "0.034"
+
+
+def test_errors_before_and_after_are_told_apart_only_where_they_differ() -> None:
+    material: Any = SimpleNamespace(evidence=None, identification=None)
+    held = {"before": 0.02, "after": 0.02, "noise_floor": 0.01, "kind": "verify", "region": {"before": 1, "after": 1}}
+    (same,) = _gain(material, {"mismatch": True, "heldout_mm": held})
+    assert "before" not in same.text
+    (apart,) = _gain(material, {"mismatch": True, "heldout_mm": held | {"after": 0.015}})
+    assert "0.02 mm (RMS) before and 0.015 after" in apart.text
