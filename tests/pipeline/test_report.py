@@ -198,4 +198,4 @@ def test_errors_before_and_after_are_told_apart_only_where_they_differ() -> None
     (same,) = _gain(material, {"mismatch": True, "heldout_mm": held})
     assert "before" not in same.text
     (apart,) = _gain(material, {"mismatch": True, "heldout_mm": held | {"after": 0.015}})
-    assert "0.02 mm (RMS) before and 0.015 after" in apart.text
+    assert "0.0200 mm (RMS) before and 0.0150 after" in apart.text
