@@ -112,9 +112,9 @@ def identify_recording(
     for _ in range(0 if recording.stated else 2):
         factors = variance_factors(found, subset, recording.select(rows), recording.observations)
         observations = rescaled(recording.observations, factors)
-        pairs = zip(recording.detailed, recording.observations, strict=False)
-        same = len(recording.detailed) == len(recording.observations) and all(a is b for a, b in pairs)
-        detailed = observations if same else rescaled(recording.detailed, [f[:1] for f in factors])
+        # points tell by their body how they scatter; what they carry, frames, follows the robot's residuals
+        pairs = zip(recording.detailed, recording.observations, observations, strict=True)
+        detailed = tuple(new if own is old else own for own, old, new in pairs)
         recording = replace(recording, observations=observations, detailed=detailed)
         found = identify(robot, subset, recording.select(rows), options, kernel)
     return found, recording

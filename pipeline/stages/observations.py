@@ -22,13 +22,16 @@ from robcal.photogrammetry.bodies import Body
 from robcal.photogrammetry.measure_frames import MeasuredFrames
 from robcal.photogrammetry.measured_points import MeasuredPoints
 from robcal.photogrammetry.shared_errors import unabsorbed_covariance
-from robcal.transforms import Array
+from robcal.transforms import Array, transform
 
 Rows = NDArray[np.int64]
 RobotObservations = FrameObservations | PointObservations | DistanceObservations | SensorPointObservations
 
 ASSUMED_SIGMA = 1e-4
 """Standard deviation (m, and rad for frames) of measurements that state none, until the residuals tell a better one."""
+
+LEAST_SIGMA = 1e-7
+"""Points that fit their body exactly, as calculated ones do, scatter by this (m)."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +108,7 @@ def frame_observations(points: MeasuredPoints, frames: MeasuredFrames) -> FrameO
 
 def _used_points(points: MeasuredPoints, frames: MeasuredFrames, body: Body | None) -> PointObservations | None:
     """The points that were not rejected, of bodies with coordinates; None where frames come from resections."""
-    if body is None or points.covariance is None:
+    if body is None:
         return None
     at = body.index(points.target)
     rejected = {(p.pose, p.target) for p in frames.rejected_points}
@@ -118,10 +121,21 @@ def _used_points(points: MeasuredPoints, frames: MeasuredFrames, body: Body | No
     usable &= several
     if set(np.unique(points.pose[usable])) != set(np.unique(frames.pose)):
         return None
-    return PointObservations(
-        points.pose[usable], body.points[at[usable]], points.p_world[usable], points.covariance[usable],
-        points.target[usable],
-    )  # fmt: skip
+    pose, on_body, measured = points.pose[usable], body.points[at[usable]], points.p_world[usable]
+    if points.covariance is not None:
+        covariance = points.covariance[usable]
+    else:
+        covariance = np.tile(_scatter(pose, on_body, measured, frames) ** 2 * np.eye(3), (len(pose), 1, 1))
+    return PointObservations(pose, on_body, measured, covariance, points.target[usable])
+
+
+def _scatter(pose: Rows, on_body: Array, measured: Array, frames: MeasuredFrames) -> float:
+    """Standard deviation (m) of points that state none, from how they scatter about the frames that they carry."""
+    order = np.argsort(frames.pose)
+    T = frames.world_T_body[order[np.searchsorted(frames.pose[order], pose)]]
+    left = measured - transform(T, on_body)
+    redundancy = 3 * len(pose) - 6 * len(np.unique(pose))
+    return max(float(np.sqrt(np.sum(left**2) / redundancy)), LEAST_SIGMA) if redundancy > 0 else ASSUMED_SIGMA
 
 
 def _from_table(table: MeasuredTable, campaign: Campaign, body: Body | None) -> RobotObservations:
