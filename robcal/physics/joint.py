@@ -10,12 +10,16 @@ import numpy as np
 from robcal.physics.family import PER_KNM, Array, Basis, Constants, Family
 from robcal.physics.site import LETTER_OF_KIND, Joint, RobotSite, breaks, exponential_law
 from robcal.physics.usual import LEAST_MOMENT
+from robcal.robot.terms import identifier
 
 TORQUE_SCALES = (0.02, 0.06, 0.2, 0.5, 1.2)
 """Scales of a lost motion that are tried first, in shares of the largest load torque: joints are built for theirs."""
 MOST_THRESHOLDS = 60
 TRIED_THRESHOLDS = 14
 """Tried first, densely where few poses count as unloaded: friction is small against loads."""
+UPRIGHT_SHARE = 0.005
+"""An axis whose torque is below this share of the moment on its bearings is upright: what torque the fit gives it comes
+from deviations of a few mrad, whose sign friction hides."""
 HIGHEST_RIPPLE_ORDER = 180
 
 
@@ -92,7 +96,7 @@ def _backlash(site: RobotSite, joint: Joint) -> Iterator[Family]:
     torque = site.variables[f"torque{k}"]
     moved = site.varies(f"approach{k}")
     largest = float(np.max(np.abs(torque)))
-    loaded = largest > 1e-3
+    loaded = largest > max(1e-3, UPRIGHT_SHARE * _moment(site, joint))
     if not moved and not (loaded and np.min(torque) < 0 < np.max(torque)):
         return
     name = f"width_{joint.unit}"
@@ -129,6 +133,12 @@ def _backlash(site: RobotSite, joint: Joint) -> Iterator[Family]:
         bases=bases,
         covariates=(f"approach{k}", f"torque{k}"),
     )
+
+
+def _moment(site: RobotSite, joint: Joint) -> float:
+    """Largest moment (N m) about any line of a joint's frame."""
+    lines = (site.variables.get(f"{identifier(joint.frame)}_m{a}") for a in ("roll", "pitch", "yaw"))
+    return max((float(np.max(np.abs(m))) for m in lines if m is not None), default=0.0)
 
 
 def _thresholds(torque: Array) -> tuple[float, ...]:

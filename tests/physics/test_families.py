@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -102,6 +104,15 @@ def test_backlash_may_have_no_threshold_at_all() -> None:
     assert np.allclose(evaluate(basis.expression, loads), [0.5, -0.5, -0.5])
     assert family.report(np.array([1e-4]), {"threshold_Nm": 0.0}).keys() == {"width_deg"}
     assert family.report(np.array([1e-4]), {"threshold_Nm": 3.0})["threshold_Nm"] == 3.0
+
+
+def test_an_upright_axis_counts_as_unloaded_whatever_small_torque_the_fit_gives_it() -> None:
+    where = site()
+    upright = replace(where, variables={**where.variables, "torque1": 1e-3 * where.variables["torque1"]})
+    family = next(f for f in families(upright) if f.cause == "backlash" and f.where == "axis1")
+    hysteresis = next(f for f in families(upright) if f.cause == "hysteresis" and f.where == "axis1")
+    assert family.bases({}) == hysteresis.bases({})
+    assert not family.ordered
 
 
 def test_an_axis_may_be_dragged_along_by_several() -> None:
