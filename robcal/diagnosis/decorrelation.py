@@ -40,6 +40,16 @@ class SharedNoise:
             blocks.append((rows, (vectors / root) @ vectors.T, (vectors * root) @ vectors.T))
         return blocks
 
+    @cached_property
+    def log_determinant(self) -> float:
+        """Logarithm of the determinant of `1 + ratio A A'`, all poses together."""
+        joints = self.moved.shape[2]
+        total = 0.0
+        for pose in np.unique(self.pose):
+            A = self.moved[self.pose == pose].reshape(-1, joints)
+            total += float(np.linalg.slogdet(np.eye(joints) + self.ratio * A.T @ A)[1])
+        return total
+
     def whiten(self, rows_first: Array) -> Array:
         """Apply the inverse root of `1 + ratio A A'` to the rows (m, ...) pose by pose."""
         out = np.empty_like(rows_first)

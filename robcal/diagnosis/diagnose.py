@@ -187,7 +187,8 @@ def _information(chosen: Selection) -> float:
     final = chosen.last.fit
     rows = len(final.residual)
     numbers = len(final.free) + sum(len(item.values) for item in final.accepted if item.family.displace is not None)
-    return rows * float(np.log(final.residual @ final.residual / rows)) + numbers * float(np.log(rows))
+    fit_and_weights = rows * float(np.log(final.residual @ final.residual / rows)) + chosen.recording.log_determinant
+    return fit_and_weights + numbers * float(np.log(rows))
 
 
 def thinned(recording: Recording) -> Recording:

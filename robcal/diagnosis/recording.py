@@ -103,6 +103,16 @@ class Recording:
         """Values (n,) of expressions already evaluated that depend on the recording alone, not on the model."""
         return {}
 
+    @property
+    def scatter(self) -> float:
+        """Variance of the joints in units of the variance factor; zero where none was seen."""
+        return 0.0 if self.shared is None else self.shared.ratio
+
+    @property
+    def log_determinant(self) -> float:
+        """Logarithm of the determinant that the scatter of the joints gives the covariance of the whitened rows."""
+        return 0.0 if self.shared is None else self.shared.log_determinant
+
     def pose_name(self, index: float) -> str:
         """Name of the pose with a value of the covariate `index`."""
         nearest = int(np.argmin(np.abs(self.covariates["index"] - index)))

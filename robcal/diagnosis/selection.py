@@ -22,6 +22,8 @@ from robcal.physics.family import Array, Constants, Family, Key
 from robcal.physics.usual import usual_size
 from robcal.robot.model import RobotModel
 
+SAME_SCATTER = 0.2
+"""Relative change of the joints' variance that changes no decision."""
 DOUBT = 6.0
 """Evidence that a law loses by leaving something significant at its own place: two causes there are rare."""
 SECOND = 3.0
@@ -129,7 +131,8 @@ def select(
         if look.p_value <= _level(look, accepted, settings) and len(accepted) < settings.most:
             trial = _extended(model, recording, free, look, barred, settings, tell)
         if trial is not None:
-            present, accepted = trial, trial.accepted
+            accepted = trial.accepted
+            recording, present = _weighed(model, recording, free, trial)
             p_values.append(look.p_value)
             continue
         if settled or len(accepted) < 2:
@@ -142,6 +145,15 @@ def select(
             break
         present = fit(model, recording, free, accepted)
     return Selection(recording, present.accepted, tuple(p_values), first, look, free, tied, tuple(left_out))
+
+
+def _weighed(model: RobotModel, recording: Recording, free: tuple[str, ...], present: Fit) -> tuple[Recording, Fit]:
+    """The recording weighed by the scatter of the joints beside the causes found so far, which had looked like some."""
+    again = estimate_noise(model, recording, free, present.accepted).apply(recording)
+    before, after = recording.scatter, again.scatter
+    if abs(after - before) <= SAME_SCATTER * max(after, before):
+        return recording, present
+    return again, fit(model, again, free, present.accepted)
 
 
 def _level(look: Analysis, accepted: tuple[Accepted, ...], settings: SelectionSettings) -> float:

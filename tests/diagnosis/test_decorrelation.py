@@ -18,6 +18,7 @@ def test_shared_errors_become_white_and_come_back() -> None:
     covariance = np.eye(15) + 2.5 * A @ A.T
     W = shared.whiten(np.eye(15))
     assert np.allclose(W @ covariance @ W.T, np.eye(15), atol=1e-10)
+    assert np.isclose(shared.log_determinant, np.linalg.slogdet(covariance)[1])
     x = rng.normal(size=(15, 4))
     assert np.allclose(shared.unwhiten(shared.whiten(x)), x)
 
