@@ -14,6 +14,8 @@ from robcal.robot.terms import identifier
 
 TORQUE_SCALES = (0.02, 0.06, 0.2, 0.5, 1.2)
 """Scales of a lost motion that are tried first, in shares of the largest load torque: joints are built for theirs."""
+KNOWN_TO_GIVE = 3.0
+"""Prior weight of a joint's own compliance where the model leaves it out: every joint gives way about its axis."""
 MOST_THRESHOLDS = 60
 TRIED_THRESHOLDS = 14
 """Tried first, densely where few poses count as unloaded: friction is small against loads."""
@@ -61,6 +63,7 @@ def _stiffness(site: RobotSite, joint: Joint) -> Iterator[Family]:
             lambda v, c: {"compliance_deg_per_kNm": float(v[0]) * PER_KNM},
             "{where} gives way about its own axis by {compliance_deg_per_kNm:.3g} deg/kNm, which the model leaves out",
             positive=0.98,
+            weight=KNOWN_TO_GIVE,
             frees=(elastic,),
         )
     held = float(site.model.parameters.get(elastic, 0.0))
