@@ -57,8 +57,8 @@ def diagnose(
     recording : the poses that were used to identify; no others touch any decision.
     verify : kept-out recording, used only to report the gain; without it whole blocks of poses are folded.
     optional : fitted parameters that the identification took for the evidence in the residuals (elasticities across
-        axes). An effect that is left out makes such evidence as well, so where one is found the search is repeated
-        without them; those it needs come back into the model and are no findings.
+        axes). An effect that is left out makes such evidence as well, so the search is repeated without them; those it
+        needs come back into the model and are no findings.
     """
     start = time.perf_counter()
     free, tied = tuple(free), frozenset(tied)
@@ -84,7 +84,7 @@ def diagnose(
     else:
         chosen = select(model, noise.apply(thin), free, tied, settings, tell)
         again = None
-        if chosen.accepted and silent:
+        if silent:  # they may have absorbed all of it
             again = select(bare_model, noise.apply(thin), bare, tied, settings, tell, chosen.first.family_wise)
         if again is not None and _information(again) < _information(chosen):
             chosen = again
