@@ -261,8 +261,8 @@ def _findings(
         if item.family.frees and silent.issuperset(item.family.frees):
             continue
         others = tuple(other for j, other in enumerate(final.accepted) if j != k)
-        look = chosen.first
-        if others:
+        look = chosen.without[k] if chosen.without else chosen.first
+        if others and not chosen.without:
             rest = fit(model, chosen.recording, chosen.free, others)
             look = analyse(rest, chosen.recording, chosen.tied, level=chosen.first.family_wise)
         partial = fit(model, chosen.recording, chosen.free, final.accepted[: k + 1])

@@ -70,6 +70,7 @@ class Selection:
     first, last : looks at the first fit and at the last one.
     free, tied : fitted and eliminated parameters at the end.
     blunders : observations left out: (index in the recording given, its pose's row).
+    without : with several causes, looks at the fits without one of them each, in their order.
     """
 
     recording: Recording
@@ -80,6 +81,7 @@ class Selection:
     free: tuple[str, ...]
     tied: frozenset[str]
     blunders: tuple[tuple[int, int], ...]
+    without: tuple[Analysis, ...] = ()
 
 
 DEFAULTS = SelectionSettings()
@@ -102,6 +104,7 @@ def select(
     most_blunders = int(settings.blunder_share * len(number))
     first: Analysis | None = None
     barred: set[Key] = set()
+    without: tuple[Analysis, ...] = ()
     settled, weighed = False, True
     present = fit(model, recording, free)
     while True:
@@ -138,13 +141,13 @@ def select(
         if settled or len(accepted) < 2:
             break
         settled = True
-        changed, accepted, p_values = _backward(
+        accepted, p_values, without = _backward(
             model, recording, free, tied, present, p_values, settings, first.family_wise
         )
-        if not changed:
+        if without:
             break
         present = fit(model, recording, free, accepted)
-    return Selection(recording, present.accepted, tuple(p_values), first, look, free, tied, tuple(left_out))
+    return Selection(recording, present.accepted, tuple(p_values), first, look, free, tied, tuple(left_out), without)
 
 
 def _weighed(model: RobotModel, recording: Recording, free: tuple[str, ...], present: Fit) -> tuple[Recording, Fit]:
@@ -265,15 +268,20 @@ def _backward(
     p_values: list[float],
     settings: SelectionSettings,
     level: FamilyWise,
-) -> tuple[bool, tuple[Accepted, ...], list[float]]:
-    """With all others in the model: is each cause still needed, and is its name still the best?"""
+) -> tuple[tuple[Accepted, ...], list[float], tuple[Analysis, ...]]:
+    """With all others in the model: is each cause still needed, and is its name still the best?
+
+    Also returns the looks without one of them each, if all of them stay.
+    """
     accepted = list(present.accepted)
     probabilities = list(p_values)
+    looks: list[Analysis] = []
     changed = False
     k = 0
     while k < len(accepted) and len(accepted) > 1:
         others = tuple(accepted[:k] + accepted[k + 1 :])
         look = analyse(fit(model, recording, free, others), recording, tied, level=level)
+        looks.append(look)
         if look.p_value > settings.level:
             accepted = list(look.fit.accepted)
             del probabilities[k]
@@ -289,7 +297,7 @@ def _backward(
             accepted.insert(k, accepted_from(look, family, constants))
             changed = True
         k += 1
-    return changed, tuple(accepted), probabilities
+    return tuple(accepted), probabilities, () if changed else tuple(looks)
 
 
 def _gain(look: Analysis, family: int, present: Accepted) -> float:
