@@ -319,8 +319,7 @@ def told_through(final: Fit, item: Accepted, covariance: Array, factor: float) -
     ratio = written / value
     own = final.free.index(name)
     number = next(k for k, other in enumerate(final.accepted) if other is item)
-    names = [f"{item.family.where}_{item.family.cause}_{number}.{short}" for short in item.names]
-    mixed = final.covariance[[final.free.index(full) for full in names], own] * factor
+    mixed = final.covariance[[final.free.index(full) for full in item.full_names(number)], own] * factor
     slope = -item.values * ratio / value
     cross = np.outer(ratio * mixed, slope)
     spread = ratio**2 * covariance + cross + cross.T + final.covariance[own, own] * factor * np.outer(slope, slope)

@@ -43,6 +43,14 @@ class Accepted:
         """Short names of the amplitudes."""
         return self.family.names(self.constants)
 
+    def term(self, number: int) -> str:
+        """Name of its term in the kernel, as the cause of that number."""
+        return f"{self.family.where}_{self.family.cause}_{number}"
+
+    def full_names(self, number: int) -> tuple[str, ...]:
+        """Names of the kernel's parameters that are the amplitudes of a robot cause."""
+        return self.family.frees or tuple(f"{self.term(number)}.{short}" for short in self.names)
+
 
 @dataclass(frozen=True)
 class Fit:
@@ -79,8 +87,7 @@ class Fit:
         """Columns of `jacobian` that belong to the amplitudes of one of the accepted causes."""
         number = next(k for k, other in enumerate(self.accepted) if other is item)
         if item.family.displace is None:
-            short = (f"{item.family.where}_{item.family.cause}_{number}.{name}" for name in item.names)
-            return np.array([self.free.index(name) for name in item.family.frees or short], dtype=np.intp)
+            return np.array([self.free.index(name) for name in item.full_names(number)], dtype=np.intp)
         before = [len(other.names) for other in self.accepted[:number] if other.family.displace is not None]
         return np.arange(len(item.names), dtype=np.intp) + len(self.free) + sum(before)
 
@@ -100,7 +107,7 @@ def terms_of(accepted: Accepted, number: int) -> tuple[Term, ...]:
     family = accepted.family
     if family.bases is None:
         return ()
-    name = f"{family.where}_{family.cause}_{number}"
+    name = accepted.term(number)
     values = dict(zip(accepted.names, map(float, accepted.values), strict=True))
     groups: dict[tuple[str, str], list[tuple[str, str]]] = {}
     for basis in family.bases(accepted.constants):
@@ -245,9 +252,7 @@ def _amplitudes(
             values = linear[offset : offset + width]
             offset += width
         else:
-            full = item.family.frees or tuple(
-                f"{item.family.where}_{item.family.cause}_{number}.{short}" for short in item.names
-            )
+            full = item.full_names(number)
             where = np.array([names.index(name) for name in full])
             values = np.array([theta[position[name]] for name in full])
         done.append(replace(item, values=values, covariance=covariance[np.ix_(where, where)]))
