@@ -103,9 +103,13 @@ def isolated_table(side: int = 12) -> None:
         row, true = row[hit], true[hit]
         variance = case.read_noise**2 + 15.0 * case.gain + 1 / 12
         bound = centre_bound(
-            (case.radius, case.radius * case.ratio), 0.0, _BLUR, case.contrast, 15.0,
+            (case.radius, case.radius * case.ratio),
+            0.0,
+            _BLUR,
+            case.contrast,
+            15.0,
             NoiseModel(variance, case.gain, 15.0),
-        )  # fmt: skip
+        )
         limit = np.sqrt(np.trace(bound) / 2)
         xy, axes, ground = found.xy[row], found.semi_axes[row], found.background[row]
         errors = [
@@ -169,11 +173,16 @@ def _score(rendered: RenderedImage) -> dict[str, float]:
     nearest, target = cKDTree(truth.area_centre).query(found.xy)
     wrong = (found.code >= 0) & ((nearest > 2.0) | (truth.ids[target] != found.code))
     return {
-        "targets": float(whole.sum()), "found": float(hit.sum()), "coded": float((whole & coded).sum()),
-        "read": float((hit & coded & (found.code[row] == truth.ids)).sum()), "wrong": float(wrong.sum()),
-        "strangers": float((nearest > 2.0).sum()), "squares": float((error**2).sum()), "nees": float(nees.sum()),
+        "targets": float(whole.sum()),
+        "found": float(hit.sum()),
+        "coded": float((whole & coded).sum()),
+        "read": float((hit & coded & (found.code[row] == truth.ids)).sum()),
+        "wrong": float(wrong.sum()),
+        "strangers": float((nearest > 2.0).sum()),
+        "squares": float((error**2).sum()),
+        "nees": float(nees.sum()),
         "seconds": seconds,
-    }  # fmt: skip
+    }
 
 
 def _twelve_megapixels(rng: np.random.Generator, targets: int = 150, coded: int = 50) -> NDArray[np.uint8]:

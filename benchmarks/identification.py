@@ -31,10 +31,17 @@ def mean_error(robot: IdentifiedRobot, truth: Truth, poses: PoseInputs) -> float
 def accuracy(seeds: int) -> None:
     """Mean tool error on kept-out poses for choices of parameters, against the oracle."""
     kernel = Kernel(kr125_like())
-    needless = [f"{f.name}.{k}" for f in kernel.model.frames for k in
-                ("x", "y", "z", "roll", "pitch", "yaw", "elastic_roll", "elastic_pitch", "elastic_yaw")]
-    choices: dict[str, object] = {"standard (by evidence)": "standard", "geometry": "geometry",
-                                  "table5.4": "table5.4", "everything": needless}
+    needless = [
+        f"{f.name}.{k}"
+        for f in kernel.model.frames
+        for k in ("x", "y", "z", "roll", "pitch", "yaw", "elastic_roll", "elastic_pitch", "elastic_yaw")
+    ]
+    choices: dict[str, object] = {
+        "standard (by evidence)": "standard",
+        "geometry": "geometry",
+        "table5.4": "table5.4",
+        "everything": needless,
+    }
     rows: list[list[object]] = []
     for compliant in (False, True):
         errors: dict[str, list[float]] = {name: [] for name in (*choices, "oracle")}
@@ -50,10 +57,22 @@ def accuracy(seeds: int) -> None:
                 errors[name].append(mean_error(robot, truth, kept_out))
                 parameters[name].append(len(robot.names))
         oracle = np.mean(errors["oracle"])
-        rows += [["compliant" if compliant else "geometry only", name, float(np.mean(parameters[name])),
-                  float(np.mean(e)), float(np.max(e)), float(np.mean(e) / oracle)] for name, e in errors.items()]
-    table(f"Mean tool error at 500 kept-out poses, {seeds} seeds",
-          ["true robot", "identified", "parameters", "mean mm", "worst mm", "ratio to oracle"], rows)
+        rows += [
+            [
+                "compliant" if compliant else "geometry only",
+                name,
+                float(np.mean(parameters[name])),
+                float(np.mean(e)),
+                float(np.max(e)),
+                float(np.mean(e) / oracle),
+            ]
+            for name, e in errors.items()
+        ]
+    table(
+        f"Mean tool error at 500 kept-out poses, {seeds} seeds",
+        ["true robot", "identified", "parameters", "mean mm", "worst mm", "ratio to oracle"],
+        rows,
+    )
 
 
 def timing(repeats: int) -> None:
@@ -76,8 +95,10 @@ def timing(repeats: int) -> None:
     theta = truth.theta
     rows: list[list[object]] = [
         ["build the kernel", shortest(lambda: Kernel(model).function("jacobian"))],
-        [f"frames and Jacobian, 80 poses x {len(kernel.names)} columns",
-         shortest(lambda: truth.kernel.frames_and_jacobian(theta, poses))],
+        [
+            f"frames and Jacobian, 80 poses x {len(kernel.names)} columns",
+            shortest(lambda: truth.kernel.frames_and_jacobian(theta, poses)),
+        ],
         ["identify, kernel at hand", shortest(lambda: identify(kernel.model, poses, [observed], kernel=kernel))],
         ["identify, kernel built", shortest(lambda: identify(model, poses, [observed]))],
     ]
@@ -99,8 +120,11 @@ def convergence(robots: int) -> None:
         if not (first.converged and robot.summary.converged and 0.8 < robot.sigma0 < 1.2):
             bad.append(seed)
     counts = np.bincount(steps)
-    table(f"Gauss-Newton from zero, deviations three times the usual: {robots - len(bad)} of {robots} converge",
-          ["steps", "robots"], [[str(k), int(c)] for k, c in enumerate(counts) if c])
+    table(
+        f"Gauss-Newton from zero, deviations three times the usual: {robots - len(bad)} of {robots} converge",
+        ["steps", "robots"],
+        [[str(k), int(c)] for k, c in enumerate(counts) if c],
+    )
     if bad:
         print(f"  not converged: seeds {bad}")
 
@@ -130,15 +154,23 @@ def coverage(runs: int) -> None:
             if name not in base:
                 miss[name] = plain.theta[kernel.index[name]] - robot.values[name]
             kind = name.rsplit(".", 1)[-1]
-            group = name.split(".", maxsplit=1)[0] if name in base else "elastic" if "elastic" in kind else (
-                "length" if kind in "xyz" else "angle")
+            group = (
+                name.split(".", maxsplit=1)[0]
+                if name in base
+                else "elastic"
+                if "elastic" in kind
+                else ("length" if kind in "xyz" else "angle")
+            )
             inside.setdefault(group, []).append(abs(miss[name]) < 1.959964 * sigma[name])
         T, C = predict_frames(robot, kept_out)
         d = tf.difference(T, plain.frames(kept_out))[:, :3]
         z = np.einsum("ni,nij,nj->n", d, np.linalg.inv(C[:, :3, :3]), d)
         inside.setdefault("predicted position", []).extend((z < stats.chi2.isf(0.05, 3)).tolist())
-    table(f"Coverage of 95 % intervals, {runs} runs", ["kind", "intervals", "inside %"],
-          [[name, len(v), 100.0 * float(np.mean(v))] for name, v in inside.items()])
+    table(
+        f"Coverage of 95 % intervals, {runs} runs",
+        ["kind", "intervals", "inside %"],
+        [[name, len(v), 100.0 * float(np.mean(v))] for name, v in inside.items()],
+    )
 
 
 def _only(observed: Observations, wanted: np.ndarray, rows: np.ndarray) -> Observations:
@@ -165,7 +197,9 @@ def agreement(seeds: int) -> None:
             np.arange(n), np.zeros((n, 3)), p, np.broadcast_to(25e-10 * np.eye(3), (n, 3, 3)), np.zeros(n)
         )
         sets = (  # rows measured in 6D, rows measured in 3D
-            (np.arange(80), np.arange(0)), (np.arange(0), np.arange(80, 240)), (np.arange(40), np.arange(80, 160)),
+            (np.arange(80), np.arange(0)),
+            (np.arange(0), np.arange(80, 240)),
+            (np.arange(40), np.arange(80, 160)),
         )
         robots = []
         for in_6d, in_3d in sets:
@@ -181,10 +215,15 @@ def agreement(seeds: int) -> None:
         z = np.einsum("ni,nij,nj->n", d, np.linalg.inv(C), d)
         squares.append(float(np.mean(z)) / 3.0)
         inside += (z < stats.chi2.isf(0.05, 3)).tolist()
-    table(f"3D and 6D of the same robot, {seeds} seeds", ["measured", "mean mm", "worst mm"],
-          [[name, float(np.mean(e)), float(np.max(e))] for name, e in errors.items()])
-    print(f"  3D against 6D at 100 kept-out poses: squared normalised difference {np.mean(squares):.2f} per degree of "
-          f"freedom, {100 * np.mean(inside):.1f} % inside the joint 95 % region")
+    table(
+        f"3D and 6D of the same robot, {seeds} seeds",
+        ["measured", "mean mm", "worst mm"],
+        [[name, float(np.mean(e)), float(np.max(e))] for name, e in errors.items()],
+    )
+    print(
+        f"  3D against 6D at 100 kept-out poses: squared normalised difference {np.mean(squares):.2f} per degree of "
+        f"freedom, {100 * np.mean(inside):.1f} % inside the joint 95 % region"
+    )
 
 
 def main() -> None:

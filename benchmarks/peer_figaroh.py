@@ -29,7 +29,12 @@ COMPONENTS = ("x", "y", "z", "phix", "phiy", "phiz")
 
 
 def predicted_positions(
-    model: RobotModel, payload: str, q: np.ndarray, T: np.ndarray, q_out: np.ndarray, elastic: bool,
+    model: RobotModel,
+    payload: str,
+    q: np.ndarray,
+    T: np.ndarray,
+    q_out: np.ndarray,
+    elastic: bool,
     mended: bool = False,
 ) -> tuple[np.ndarray, float]:
     """Predicted tool positions (n, 3) at kept-out joint angles and processor seconds of set-up and fit.
@@ -92,7 +97,8 @@ def _config(robot: Any, data: Path, samples: int, elastic: bool) -> dict[str, An
         "robot": {"name": "arm"},
         "tasks": {
             "calibration": {
-                "type": "kinematic_calibration", "enabled": True,
+                "type": "kinematic_calibration",
+                "enabled": True,
                 "kinematics": {"base_frame": "universe", "tool_frame": frames[-1]},
                 "measurements": {"markers": [{"measurable_dof": [True] * 6}]},
                 "parameters": {"calibration_level": "full_params", "include_non_geometric": elastic},
@@ -100,4 +106,3 @@ def _config(robot: Any, data: Path, samples: int, elastic: bool) -> dict[str, An
             }
         },
     }
-

@@ -23,15 +23,17 @@ from robcal.calibration.start_values import hand_eye
 from robcal.robot.kernel import Kernel, PoseInputs
 from robcal.robot.model import RobotModel
 
-MODIFIED_DH = np.array([
-    # alpha, a, theta, d
-    [0, 0, 0, 0.865],
-    [-np.pi / 2, 0.41, 0, 0],
-    [0, 1.0, -np.pi / 2, 0],
-    [-np.pi / 2, -0.045, 0, 1.0],
-    [np.pi / 2, 0, 0, 0],
-    [-np.pi / 2, 0, 0, 0.21],
-])
+MODIFIED_DH = np.array(
+    [
+        # alpha, a, theta, d
+        [0, 0, 0, 0.865],
+        [-np.pi / 2, 0.41, 0, 0],
+        [0, 1.0, -np.pi / 2, 0],
+        [-np.pi / 2, -0.045, 0, 1.0],
+        [np.pi / 2, 0, 0, 0],
+        [-np.pi / 2, 0, 0, 0.21],
+    ]
+)
 
 
 def _pybotics(q: np.ndarray, T: np.ndarray, q_out: np.ndarray) -> tuple[np.ndarray, float]:
@@ -44,11 +46,12 @@ def _pybotics(q: np.ndarray, T: np.ndarray, q_out: np.ndarray) -> tuple[np.ndarr
     robot.world_frame = W
     robot.tool.matrix = F
     start = time.process_time()
-    handler = OptimizationHandler(
-        robot, kinematic_chain_mask=True, tool_mask=[True] * 3 + [False] * 3, world_mask=True
-    )
+    handler = OptimizationHandler(robot, kinematic_chain_mask=True, tool_mask=[True] * 3 + [False] * 3, world_mask=True)
     result = optimize.least_squares(
-        optimize_accuracy, handler.generate_optimization_vector(), args=(handler, q, T[:, :3, 3]), x_scale="jac",
+        optimize_accuracy,
+        handler.generate_optimization_vector(),
+        args=(handler, q, T[:, :3, 3]),
+        x_scale="jac",
         max_nfev=20,
     )
     handler.apply_optimization_vector(result.x)
@@ -80,8 +83,11 @@ def compare(seeds: int = 1) -> None:
         for name, values in found.items():
             error, seconds = (float(v) for v in np.mean(values, axis=0))
             rows.append([kind, name, error, seconds, seconds / ours])
-    table(f"Peers, {seeds} seed(s), 80 poses, kernel included",
-          ["true robot", "program", "mean mm", "processor s", "time ratio"], rows)
+    table(
+        f"Peers, {seeds} seed(s), 80 poses, kernel included",
+        ["true robot", "program", "mean mm", "processor s", "time ratio"],
+        rows,
+    )
     for name in ("figaroh", "pybotics"):
         if importlib.util.find_spec(name) is None:
             print(f"  {name} is not installed: pip install -e '.[benchmark]'")

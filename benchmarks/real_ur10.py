@@ -39,8 +39,12 @@ def read_chain(path: Path) -> RobotModel:
     data = yaml.safe_load(path.read_text(encoding="utf-8"))
     frames = tuple(
         Frame(
-            f["name"], f["axis"], sign=f.get("sign", 1), xyz=tuple(np.array(f["xyz_mm"]) * 1e-3),
-            rpy=tuple(np.deg2rad(f["rpy_deg"])), mass=f.get("mass_kg", 0.0),
+            f["name"],
+            f["axis"],
+            sign=f.get("sign", 1),
+            xyz=tuple(np.array(f["xyz_mm"]) * 1e-3),
+            rpy=tuple(np.deg2rad(f["rpy_deg"])),
+            mass=f.get("mass_kg", 0.0),
             cog=tuple(np.array(f.get("cog_mm", (0, 0, 0))) * 1e-3),
         )
         for f in data["frames"]
@@ -55,8 +59,9 @@ def read_series(folder: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nd
     six = table[["x_mm", "y_mm", "z_mm", "roll_deg", "pitch_deg", "yaw_deg"]].to_numpy()
     T = tf.frame_from_xyzrpy(np.concatenate([six[:, :3] * 1e-3, np.deg2rad(six[:, 3:])], axis=1))
     sigma = table["sigma_mm"].to_numpy() * 1e-3 if "sigma_mm" in table else np.full(len(table), DEFAULT_SIGMA)
-    turn = np.deg2rad(table["sigma_deg"].to_numpy()) if "sigma_deg" in table else np.full(
-        len(table), DEFAULT_SIGMA_ANGLE)
+    turn = (
+        np.deg2rad(table["sigma_deg"].to_numpy()) if "sigma_deg" in table else np.full(len(table), DEFAULT_SIGMA_ANGLE)
+    )
     # the tracker's own averaging says nothing about accuracy: one weight for all, its scale is estimated
     C = np.zeros((len(table), 6, 6))
     C[:, range(3), range(3)] = float(np.median(sigma)) ** 2
@@ -68,8 +73,14 @@ def harmonics(model: RobotModel, waves: Sequence[tuple[int, int]]) -> RobotModel
     """The model with harmonic errors (joint counted from 1, order): what eccentric encoders and gears leave."""
     joints = model.joints
     terms = [
-        Term(f"{joints[k - 1].name}.harmonic{m}", joints[k - 1].name, "q", f"a*cos({m}*q{k}) + b*sin({m}*q{k})",
-             {"a": 0.0, "b": 0.0}, priors={"a": WAVE_PRIOR, "b": WAVE_PRIOR})
+        Term(
+            f"{joints[k - 1].name}.harmonic{m}",
+            joints[k - 1].name,
+            "q",
+            f"a*cos({m}*q{k}) + b*sin({m}*q{k})",
+            {"a": 0.0, "b": 0.0},
+            priors={"a": WAVE_PRIOR, "b": WAVE_PRIOR},
+        )
         for k, m in waves
     ]
     return model.with_terms(terms)
@@ -144,12 +155,24 @@ def main() -> None:
         row += [1e3 * verify(robot, there, [test]).tools["0"].rms for robot in robots]
         elastic = sum("elastic" in n for n in found.names)
         rows.append([*row, elastic, len(waves)])
-        orders.append(f"  {series.upper()}: " + "; ".join(
-            f"axis {k}: {', '.join(str(m) for j, m in waves if j == k)}" for k in range(1, 7)))
+        orders.append(
+            f"  {series.upper()}: "
+            + "; ".join(f"axis {k}: {', '.join(str(m) for j, m in waves if j == k)}" for k in range(1, 7))
+        )
     table(
         "UR10 and laser tracker: RMS of the position error at kept-out poses, mm",
-        ["series", "identify", "verify", "nominal", "geometry", "+ elasticity", "+ harmonics 1-4",
-         "or by evidence", "elastic", "waves"],
+        [
+            "series",
+            "identify",
+            "verify",
+            "nominal",
+            "geometry",
+            "+ elasticity",
+            "+ harmonics 1-4",
+            "or by evidence",
+            "elastic",
+            "waves",
+        ],
         rows,
     )
     print("  orders chosen by evidence\n" + "\n".join(orders))

@@ -265,8 +265,16 @@ def main() -> None:
         rows.append([training.upper(), tested.upper(), len(e[0]), *map(rms, e), middle])
     table(
         "UR10: trained on three series, base and tool alone fitted to the fourth; error at its kept-out poses, mm RMS",
-        ["trained on", "tested on", "poses", "nominal", "standard model", "+ curve of each joint",
-         "+ one curve for all", "its median"],
+        [
+            "trained on",
+            "tested on",
+            "poses",
+            "nominal",
+            "standard model",
+            "+ curve of each joint",
+            "+ one curve for all",
+            "its median",
+        ],
         rows,
     )
     inside_only = [Linear(*(v[s.inside] for v in (s.q, s.inside, s.r, s.J, s.Jq, s.cell))) for s in all_series.values()]
@@ -274,14 +282,17 @@ def main() -> None:
     rows = [[letter.upper(), *map(rms, errors(whole, s, nothing))] for letter, s in all_series.items()]
     table(
         "UR10: one robot for all four series, identified from their other poses; error at kept-out poses, mm RMS",
-        ["series", "nominal", "standard model", "+ curve of each joint", "+ one curve for all"], rows,
+        ["series", "nominal", "standard model", "+ curve of each joint", "+ one curve for all"],
+        rows,
     )
     pattern = whole.pattern
     table(
         "UR10: turns of the shared curve",
         ["axis", "turn deg", "sense", "correlation with an earlier axis"],
-        [[k + 1, float(np.degrees(pattern.turn[k]) % 360.0), int(pattern.sense[k]), whole.correlation.get(k, 1.0)]
-         for k in sorted(pattern.joints)],
+        [
+            [k + 1, float(np.degrees(pattern.turn[k]) % 360.0), int(pattern.sense[k]), whole.correlation.get(k, 1.0)]
+            for k in sorted(pattern.joints)
+        ],
     )
     if options.picture is not None:
         picture(options.picture, inside_only, whole, len(names) + 12 * len(SLOW))

@@ -26,9 +26,7 @@ from robcal.diagnosis.result import Diagnosis
 from robcal.robot.kernel import Kernel
 
 
-def recording(
-    q: np.ndarray, T: np.ndarray, C: np.ndarray, rows: np.ndarray
-) -> tuple[Recording, FrameObservations]:
+def recording(q: np.ndarray, T: np.ndarray, C: np.ndarray, rows: np.ndarray) -> tuple[Recording, FrameObservations]:
     """Some poses of a series as the diagnosis takes them; without approach directions, which were not recorded."""
     frames = FrameObservations(np.arange(len(rows)), T[rows], C[rows])
     covariates = {"index": rows.astype(float)}
@@ -71,18 +69,36 @@ def main() -> None:
         told = diagnose(found.model, train, found.names, tied, kept_out, optional=across)
         seconds = time.process_time() - clock
         before, after, _ = (1e3 * v for v in told.heldout)
-        rows.append([
-            series.upper(), len(train.q), len(kept_out.q), before, after, 1e6 * told.joint_sigma,
-            *normalised(told, kept_out, measured), seconds,
-        ])  # fmt: skip
+        rows.append(
+            [
+                series.upper(),
+                len(train.q),
+                len(kept_out.q),
+                before,
+                after,
+                1e6 * told.joint_sigma,
+                *normalised(told, kept_out, measured),
+                seconds,
+            ]
+        )
         print(f"Series {series.upper()}:")
         for finding in told.findings:
             mm = " -> ".join(f"{1e3 * v:.3f}" for v in finding.heldout)
             print(f"  {finding.statement}; kept-out error {mm} mm")
     table(
         "UR10: diagnosis of each series; RMS position error at its kept-out poses, and normalised by its prediction",
-        ["series", "poses", "kept out", "identified mm", "diagnosed mm", "joint scatter urad", "normalised, parameters",
-         "+ scatter", "median of it", "CPU s"],
+        [
+            "series",
+            "poses",
+            "kept out",
+            "identified mm",
+            "diagnosed mm",
+            "joint scatter urad",
+            "normalised, parameters",
+            "+ scatter",
+            "median of it",
+            "CPU s",
+        ],
         rows,
     )
 

@@ -86,12 +86,16 @@ def measured(
 
 def table(title: str, head: list[str], rows: list[list[object]]) -> None:
     """Print a table with right-aligned columns."""
-    cells = [head, *[[v if isinstance(v, str) else f"{v:.4g}" if isinstance(v, float) else str(v) for v in r]
-                     for r in rows]]
+    cells = [
+        head,
+        *[[v if isinstance(v, str) else f"{v:.4g}" if isinstance(v, float) else str(v) for v in r] for r in rows],
+    ]
     widths = [max(len(r[k]) for r in cells) for k in range(len(head))]
     print(f"\n{title}")
     for k, row in enumerate(cells):
-        print("  " + "  ".join(c.ljust(w) if i == 0 else c.rjust(w) for i, (c, w) in enumerate(
-            zip(row, widths, strict=True))))
+        print(
+            "  "
+            + "  ".join(c.ljust(w) if i == 0 else c.rjust(w) for i, (c, w) in enumerate(zip(row, widths, strict=True)))
+        )
         if k == 0:
             print("  " + "  ".join("-" * w for w in widths))

@@ -53,9 +53,16 @@ class Accuracy:
 
 
 def rendered(
-    cache: Path, *, images: int, size: float, seed: int, small: bool, start: str, listed: bool = True,
+    cache: Path,
+    *,
+    images: int,
+    size: float,
+    seed: int,
+    small: bool,
+    start: str,
+    listed: bool = True,
     body: str = "plate",
-) -> Path:  # fmt: skip
+) -> Path:
     """Folder with campaign/ and truth/, rendered if it is not there yet."""
     name = f"survey-{images}-{size:g}-{seed}{'-small' if small else ''}-{start}{'' if listed else '-unlisted'}"
     name += "" if body == "plate" else f"-{body}"
@@ -108,17 +115,20 @@ def survey(folder: Path, workers: int) -> tuple[SurveyResult, dict[str, Detectio
     entries = yaml.safe_load((folder / "campaign" / campaign["targets"]).read_text())["targets"]
     targets = [
         BodyTarget(
-            id=e["id"], code=e["code"], diameter=e["diameter_mm"] and e["diameter_mm"] / 1e3,
+            id=e["id"],
+            code=e["code"],
+            diameter=e["diameter_mm"] and e["diameter_mm"] / 1e3,
             xyz=None if e["xyz_mm"] is None else tuple(v / 1e3 for v in e["xyz_mm"]),
             sigma=e["sigma_mm"] / 1e3 if e.get("sigma_mm") else None,
         )
         for e in entries
-    ]  # fmt: skip
+    ]
     bars = campaign["survey"]["scale_bars"]
     lengths = Lengths(
-        np.array([b["targets"] for b in bars]), np.array([b["length_mm"] for b in bars]) / 1e3,
+        np.array([b["targets"] for b in bars]),
+        np.array([b["length_mm"] for b in bars]) / 1e3,
         np.array([b["sigma_mm"] for b in bars]) / 1e3,
-    )  # fmt: skip
+    )
     every = bars + campaign["survey"]["check_lengths"]
     codes = frozenset(t.id for t in targets if t.code) | frozenset(i for b in every for i in b["targets"])
     paths = sorted((folder / "campaign" / campaign["survey"]["images"]).glob("*.png"))
@@ -231,9 +241,15 @@ def main() -> None:
     print("                     px        um     um      ppm                    s       s")
     for seed in given.seeds:
         folder = rendered(
-            given.cache, images=given.images, size=given.size, seed=seed, small=given.small, start=given.start,
-            listed=not given.bars_unlisted, body=given.body,
-        )  # fmt: skip
+            given.cache,
+            images=given.images,
+            size=given.size,
+            seed=seed,
+            small=given.small,
+            start=given.start,
+            listed=not given.bars_unlisted,
+            body=given.body,
+        )
         a = judge(folder, given.workers)
         print(
             f"{seed:4d} {a.images:6d} {a.targets:7d}  {a.centroid_px:8.4f} {a.rms_um:6.2f} {a.stated_um:6.2f} "

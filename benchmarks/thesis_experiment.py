@@ -69,8 +69,9 @@ def one(seed: int) -> tuple[dict[str, list[np.ndarray]], dict[str, np.ndarray], 
     result = verify(robot, poses.subset(there), [test], nominal)
     floor = tool_errors(truth.frames(poses.subset(there)), [test])
     nominal_errors = result.nominal_errors or {}
-    errors = {name: [1e3 * result.errors[name], 1e3 * nominal_errors[name], 1e3 * floor[name][1]]
-              for name in TEST_VECTORS}
+    errors = {
+        name: [1e3 * result.errors[name], 1e3 * nominal_errors[name], 1e3 * floor[name][1]] for name in TEST_VECTORS
+    }
     loads: dict[str, np.ndarray] = {}
     for load in kernel.model.payloads:
         wanted = nominal.kernel.frames(nominal.full_theta, random_poses(kernel, rng, 40, load))
@@ -99,10 +100,14 @@ def main() -> None:
         rows.append(row)
     head = ["mm"] + [f"{name} {what}" for name in TEST_VECTORS for what in ("cal", "uncal", "floor")]
     table(f"Table 5.1: 23 kept-out poses, test vectors of 0, 500, 1000 mm, {seeds} robots", head, rows)
-    table("Table 5.2: other loads through the compensation, identified with 172 kg",
-          ["load", "mean mm", "max mm"],
-          [[load, float(np.mean([r[1][load].mean() for r in runs])), float(np.max([r[1][load].max() for r in runs]))]
-           for load in runs[0][1]])
+    table(
+        "Table 5.2: other loads through the compensation, identified with 172 kg",
+        ["load", "mean mm", "max mm"],
+        [
+            [load, float(np.mean([r[1][load].mean() for r in runs])), float(np.max([r[1][load].max() for r in runs]))]
+            for load in runs[0][1]
+        ],
+    )
     print(f"\n  share of kept-out poses inside their 95 % region: {np.mean([r[2] for r in runs]):.3f}")
 
 

@@ -13,8 +13,12 @@ from robcal.transforms import Array
 
 
 def common_errors(
-    observations: RobotObservations, recording: RobotRecording, rows: Rows, body: Body | None,
-    points: MeasuredPoints | None, orientation: StationOrientation | None = None,
+    observations: RobotObservations,
+    recording: RobotRecording,
+    rows: Rows,
+    body: Body | None,
+    points: MeasuredPoints | None,
+    orientation: StationOrientation | None = None,
 ) -> Array | None:
     """Displacements by one standard deviation of the errors that station and body give to all.
 

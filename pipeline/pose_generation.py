@@ -185,9 +185,16 @@ def read_request(config: Path) -> PoseRequest:
     model = read_robot(folder / entry.robot)
     payloads = {**model.payloads, **{name: p.payload() for name, p in entry.payloads.items()}}
     model = RobotModel(
-        model.name, model.frames, model.gravity, model.gravity_frame, model.parameters, model.terms, payloads,
-        model.world_T_base, model.flange_T_tool,
-    )  # fmt: skip
+        model.name,
+        model.frames,
+        model.gravity,
+        model.gravity_frame,
+        model.parameters,
+        model.terms,
+        payloads,
+        model.world_T_base,
+        model.flange_T_tool,
+    )
     choice, measuring = entry.choice, entry.measuring
     start = None
     if entry.start is not None:

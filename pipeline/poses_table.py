@@ -77,9 +77,7 @@ def joint_columns(robot: RobotModel) -> list[tuple[str, float]]:
     ]
 
 
-def read_poses(
-    path: Path, robot: RobotModel | None, payloads: Collection[str], *, to_predict: bool = False
-) -> Poses:
+def read_poses(path: Path, robot: RobotModel | None, payloads: Collection[str], *, to_predict: bool = False) -> Poses:
     """Read poses.csv; without a robot only the column ``pose`` counts.
 
     ``to_predict``: the contract's defaults for poses to predict: approach 0 (never inferred).
@@ -149,12 +147,14 @@ def _outside(table: Table, robot: RobotModel, q: Array) -> str:
         if outside.any():
             i = int(np.argmax(outside))
             unit = "mm" if joint.prismatic else "deg"
-            return str(table.error(
-                i,
-                f"{column} = {q[i, k] / factor:g} {unit} lies outside the range {low / factor:g} to {high / factor:g} "
-                f"{unit} of {joint.name} ({int(outside.sum())} such poses): correct the angle, or the range in the "
-                "robot file",
-            ))
+            return str(
+                table.error(
+                    i,
+                    f"{column} = {q[i, k] / factor:g} {unit} lies outside the range {low / factor:g} to {high / factor:g} "
+                    f"{unit} of {joint.name} ({int(outside.sum())} such poses): correct the angle, or the range in the "
+                    "robot file",
+                )
+            )
     return ""
 
 

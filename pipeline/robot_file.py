@@ -206,9 +206,7 @@ _KINDS = ["x", "y", "z", "roll", "pitch", "yaw"]
 _FRAME_KINDS = [*_KINDS, "elastic_roll", "elastic_pitch", "elastic_yaw"]
 
 
-def _check_parameter(
-    key: str, frames: list[str], terms: set[str], payloads: set[str], document: YamlDocument
-) -> None:
+def _check_parameter(key: str, frames: list[str], terms: set[str], payloads: set[str], document: YamlDocument) -> None:
     owner, _, kind = key.rpartition(".")
     where = f"{document.path}, line {document.line(('parameters', key))}: parameter '{key}'"
     if owner in terms:
@@ -248,11 +246,7 @@ def robot_data(model: RobotModel) -> dict[str, Any]:
             row["mass_kg"] = float(frame.mass)
             row["cog_mm"] = _listed(np.asarray(frame.cog) * 1000)
         frames.append(row)
-    data: dict[str, Any] = {
-        "format": FORMAT,
-        "name": model.name,
-        "gravity_m_s2": [float(v) for v in model.gravity],
-    }
+    data: dict[str, Any] = {"format": FORMAT, "name": model.name, "gravity_m_s2": [float(v) for v in model.gravity]}
     if model.gravity_frame != "base":
         data["gravity_frame"] = model.gravity_frame
     data["frames"] = frames

@@ -14,16 +14,7 @@ from pipeline.campaign import Campaign, all_sources, read_campaign
 from pipeline.codec import StaleCache
 from pipeline.files import storage_error
 from pipeline.messages import Messages
-from pipeline.runs import (
-    RUN_FORMAT,
-    Run,
-    StageRecord,
-    code_version,
-    fingerprint,
-    read_json,
-    run_file,
-    write_json,
-)
+from pipeline.runs import RUN_FORMAT, Run, StageRecord, code_version, fingerprint, read_json, run_file, write_json
 from pipeline.schemas import proposal
 from pipeline.stages.base import Context, Outcome, Stage
 from pipeline.stages.joint_log import check_joint_limits

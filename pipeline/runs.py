@@ -117,9 +117,17 @@ class Run:
     def contract_files(self) -> tuple[Path, ...]:
         """The files that a run writes for others to read."""
         return (
-            self.report, self.result, self.diagnosis, self.next_poses, self.robot, self.covariance, self.points,
-            self.frames, self.residuals, self.log,
-        )  # fmt: skip
+            self.report,
+            self.result,
+            self.diagnosis,
+            self.next_poses,
+            self.robot,
+            self.covariance,
+            self.points,
+            self.frames,
+            self.residuals,
+            self.log,
+        )
 
     def body(self, name: str) -> Path:
         """bodies/<name>.yaml"""
@@ -362,4 +370,3 @@ def fingerprint(*pieces: Any) -> str:
     """Hash of plain data."""
     text = json.dumps(plain(list(pieces)), sort_keys=True, default=str)
     return hashlib.sha256(text.encode()).hexdigest()
-

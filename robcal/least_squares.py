@@ -242,9 +242,11 @@ def split_dependent(
         for column, (k, reason, sigma) in enumerate(dropped):
             share = shares[:, column] / scale[k]  # in units of column norms: comparable between metres and radians
             strong = np.flatnonzero(np.abs(share) > 0.02 * max(1e-300, np.abs(share).max(initial=0.0)))
-            tied = {} if reason == "no influence" else {
-                names[kept[s]]: float(shares[s, column] / scale[kept[s]]) for s in strong
-            }
+            tied = (
+                {}
+                if reason == "no influence"
+                else {names[kept[s]]: float(shares[s, column] / scale[kept[s]]) for s in strong}
+            )
             eliminated.append(Eliminated(names[k], reason, tied, sigma))
     return kept, eliminated
 
@@ -317,7 +319,10 @@ def linear_statistics(J: Array) -> LinearStatistics:
     inverse = _inverse_normal(R, scale)
     sigma = np.sqrt(np.diag(inverse))
     return LinearStatistics(
-        inverse, float(values[0] / values[-1]), float(raw[0] / raw[-1]), inverse / np.outer(sigma, sigma),
+        inverse,
+        float(values[0] / values[-1]),
+        float(raw[0] / raw[-1]),
+        inverse / np.outer(sigma, sigma),
         raw / np.sqrt(len(J)),
     )
 

@@ -21,8 +21,11 @@ from fixtures.own_station import OwnPlan
 
 SNRS = (12.0, 30.0)
 SPOILT: tuple[tuple[str, Spoil], ...] = (
-    ("left/p003", "black"), ("right/p005", "white"), ("left/p008", "blurred"), ("right/p010", "other"),
-)  # fmt: skip
+    ("left/p003", "black"),
+    ("right/p005", "white"),
+    ("left/p008", "blurred"),
+    ("right/p010", "other"),
+)
 NULLS: Mapping[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "plain": ({}, {}),
     "noisy images": ({"sigma_px": 0.06}, {"sensor": Sensor(full_well=2500.0, read_noise=30.0)}),
@@ -56,9 +59,7 @@ class Imaged:
         """Robots, plates and numbers of cameras take turns."""
         cameras = 3 if self.seed % 5 == 4 else 2
         changes = NULLS[self.label][0] if self.snr is None else {}
-        return image_plan(
-            self.seed, self.label, robot=ROBOTS[self.seed // 2 % 4], cameras=cameras, **changes
-        )  # fmt: skip
+        return image_plan(self.seed, self.label, robot=ROBOTS[self.seed // 2 % 4], cameras=cameras, **changes)
 
     @property
     def photographs(self) -> Photographs:

@@ -16,9 +16,12 @@ from fixtures.own_station import OWN_BODY_CAUSES, OWN_CAMERA_CAUSES, OWN_ROBOT_C
 
 SNRS = (8.5, 15.0)
 NULLS: dict[str, dict[str, float]] = {
-    "plain": {}, "repeatability": {"joint_repeatability_rad": 15e-6}, "understated": {"stated_factor": 0.85},
-    "overstated": {"stated_factor": 1.15}, "single blunders": {"blunder_share": 0.003},
-}  # fmt: skip
+    "plain": {},
+    "repeatability": {"joint_repeatability_rad": 15e-6},
+    "understated": {"stated_factor": 0.85},
+    "overstated": {"stated_factor": 1.15},
+    "single blunders": {"blunder_share": 0.003},
+}
 ROBOTS = ("kr150", "kr150", "ur10", "irb120")
 
 

@@ -137,23 +137,42 @@ def inseparable(count: int, seed: int, level: str) -> Iterator[Scenario]:
         ratio = Effect("transmission_ratio", "axis2", None, {"ratio_error_ppm": 500.0})
         eccentric = Effect("joint_eccentricity", "axis2", None, wave)
         yield Scenario(
-            "inseparable", "lag of an unloaded axis", level, own, 12.0, partial(_sized, plan, lag, 12.0),
+            "inseparable",
+            "lag of an unloaded axis",
+            level,
+            own,
+            12.0,
+            partial(_sized, plan, lag, 12.0),
             ("backlash", "hysteresis"),
-        )  # fmt: skip
+        )
         yield Scenario(
-            "inseparable", "base or station moved", level, own, 15.0,
-            partial(_single, own, level, "base_moved", 15.0), ("base_moved", "camera_moved"),
-        )  # fmt: skip
+            "inseparable",
+            "base or station moved",
+            level,
+            own,
+            15.0,
+            partial(_single, own, level, "base_moved", 15.0),
+            ("base_moved", "camera_moved"),
+        )
         yield Scenario(
-            "inseparable", "axis 2 on a short range", level, own, 10.0,
+            "inseparable",
+            "axis 2 on a short range",
+            level,
+            own,
+            10.0,
             partial(_sized, partial(plan, axis_ranges={"axis2": 0.25}), ratio, 10.0),
-            ("transmission_ratio", "joint_eccentricity"), follow=True,
-        )  # fmt: skip
+            ("transmission_ratio", "joint_eccentricity"),
+            follow=True,
+        )
         yield Scenario(
-            "inseparable", "eccentricity or balancing torque", level, own, 12.0,
+            "inseparable",
+            "eccentricity or balancing torque",
+            level,
+            own,
+            12.0,
             partial(_sized, partial(plan, payloads=("dumbbell",)), eccentric, 12.0),
             ("joint_eccentricity", "counterbalance"),
-        )  # fmt: skip
+        )
 
 
 def decoys(count: int, seed: int, level: str) -> Iterator[Scenario]:

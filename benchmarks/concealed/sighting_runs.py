@@ -15,9 +15,11 @@ from fixtures.sightings import STATION_CAUSES, SURVEY_CAUSES, make_sightings
 
 SNRS = (6.0, 8.5, 12.0, 20.0)
 NULLS: dict[str, dict[str, float]] = {
-    "plain": {}, "understated": {"stated_factor": 0.87}, "overstated": {"stated_factor": 1.15},
+    "plain": {},
+    "understated": {"stated_factor": 0.87},
+    "overstated": {"stated_factor": 1.15},
     "single blunders": {"blunder_share": 0.002},
-}  # fmt: skip
+}
 
 
 @dataclass(frozen=True)
@@ -55,9 +57,13 @@ def run_sighting(sighting: Sighting) -> dict[str, Any]:
     with tempfile.TemporaryDirectory(prefix="concealed-") as folder:
         root = Path(folder)
         plan = make_sightings(
-            root / "campaign", seed=sighting.seed, kind=sighting.level, snr=sighting.snr,
-            effects=[] if sighting.snr is None else [sighting.label], **NULLS.get(sighting.label, {}),
-        )  # fmt: skip
+            root / "campaign",
+            seed=sighting.seed,
+            kind=sighting.level,
+            snr=sighting.snr,
+            effects=[] if sighting.snr is None else [sighting.label],
+            **NULLS.get(sighting.label, {}),
+        )
         record["truth"] = [e.as_dict() for e in plan.effects]
         try:
             answer = command(root / "campaign", {})

@@ -115,8 +115,14 @@ class Verdict:
     table: Table | None = None
 
 
-def table(columns: Sequence[str], rows: Sequence[Sequence[object]], caption: str = "", text: Sequence[int] = (0,),
-          emphasis: Sequence[int] = (), shown: int = 60) -> Table:
+def table(
+    columns: Sequence[str],
+    rows: Sequence[Sequence[object]],
+    caption: str = "",
+    text: Sequence[int] = (0,),
+    emphasis: Sequence[int] = (),
+    shown: int = 60,
+) -> Table:
     """A table from anything that can be printed; all columns but `text` are numbers."""
     numeric = frozenset(range(len(columns))) - frozenset(text)
     cells = tuple(tuple("" if c is None else str(c) for c in row) for row in rows)

@@ -123,18 +123,28 @@ def _causes(causes: list[dict[str, Any]]) -> Table:
         explained = _share(c.get("explained"))
         rows.append([k, said(c.get("cause")), place, numbers, probability(c.get("p_value")), explained, change])
     return table(
-        ["", "Cause", "Where", "Parameters ± sigma", "p", "Explains", "Error on kept-out data"], rows,
+        ["", "Cause", "Where", "Parameters ± sigma", "p", "Explains", "Error on kept-out data"],
+        rows,
         "In the order in which they were accepted; the results of this run are already corrected for them.",
         text=(0, 1, 2, 3),
-    )  # fmt: skip
+    )
 
 
 def _parameter(name: str, value: Any, sigma: Any) -> str:
     unit = ""
     shown = name
-    for suffix, told in (("_deg_per_kNm3", "deg/kNm³"), ("_deg_per_kNm", "deg/kNm"), ("_um_per_m_K", "µm/(m K)"),
-                         ("um_per_m_K", "µm/(m K)"), ("_deg", "deg"), ("_mm", "mm"), ("_Nm", "N m"), ("_kg", "kg"),
-                         ("_ppm", "ppm"), ("_px", "px")):  # fmt: skip
+    for suffix, told in (
+        ("_deg_per_kNm3", "deg/kNm³"),
+        ("_deg_per_kNm", "deg/kNm"),
+        ("_um_per_m_K", "µm/(m K)"),
+        ("um_per_m_K", "µm/(m K)"),
+        ("_deg", "deg"),
+        ("_mm", "mm"),
+        ("_Nm", "N m"),
+        ("_kg", "kg"),
+        ("_ppm", "ppm"),
+        ("_px", "px"),
+    ):
         if name.endswith(suffix) and name != suffix:
             shown, unit = name.removesuffix(suffix).replace("_", " ") or "amount", f" {told}"
             break
@@ -198,8 +208,10 @@ def _cameras(material: Material) -> dict[str, tuple[Camera, Any, Array]]:
         path = source.start_path if source is not None else None
         network = survey.network
         out[path.stem if path is not None else f"survey_{name}"] = (
-            network.camera, network.intrinsics_covariance, network.marks.xy,
-        )  # fmt: skip
+            network.camera,
+            network.intrinsics_covariance,
+            network.marks.xy,
+        )
     if material.station is not None:
         marks = material.station.marks
         for c, (name, camera) in enumerate(zip(material.station.names, material.station.cameras, strict=True)):
@@ -236,16 +248,45 @@ def _gain(material: Material, d: Mapping[str, Any]) -> list[Block]:
         )
         lines, notes = [], []
         if floor:
-            lines.append({"type": "line", "xref": "paper", "x0": 0, "x1": 1, "y0": floor, "y1": floor,
-                          "line": {"color": GREY, "dash": "dash"}})  # fmt: skip
-            notes.append({"xref": "paper", "x": 1, "y": floor, "text": "noise", "showarrow": False, "yanchor": "bottom",
-                          "xanchor": "right", "font": {"color": GREY}})  # fmt: skip
+            lines.append(
+                {
+                    "type": "line",
+                    "xref": "paper",
+                    "x0": 0,
+                    "x1": 1,
+                    "y0": floor,
+                    "y1": floor,
+                    "line": {"color": GREY, "dash": "dash"},
+                }
+            )
+            notes.append(
+                {
+                    "xref": "paper",
+                    "x": 1,
+                    "y": floor,
+                    "text": "noise",
+                    "showarrow": False,
+                    "yanchor": "bottom",
+                    "xanchor": "right",
+                    "font": {"color": GREY},
+                }
+            )
         blocks.append(
-            Figure(data, layout("pose, the worst first", "error (mm)", barmode="group", shapes=lines, annotations=notes,
-                                xaxis={"type": "category", "nticks": 24}),
-                   f"What the diagnosis gains on {kept}: error of each pose with and without the causes found.",
-                   "Errors of kept-out poses before and after the diagnosis", height=300)
-        )  # fmt: skip
+            Figure(
+                data,
+                layout(
+                    "pose, the worst first",
+                    "error (mm)",
+                    barmode="group",
+                    shapes=lines,
+                    annotations=notes,
+                    xaxis={"type": "category", "nticks": 24},
+                ),
+                f"What the diagnosis gains on {kept}: error of each pose with and without the causes found.",
+                "Errors of kept-out poses before and after the diagnosis",
+                height=300,
+            )
+        )
     return blocks
 
 
@@ -286,9 +327,5 @@ def _next_poses(rows: list[dict[str, Any]]) -> list[Block]:
     if not rows:
         return []
     columns = list(dict.fromkeys(key for row in rows for key in row))
-    cells = [
-        [number(v, 5) if isinstance(v, float) else v for v in (row.get(c, "") for c in columns)] for row in rows
-    ]
-    return [
-        table(columns, cells, "Poses that would separate the rivals best; as a table in next_poses.csv.", shown=8)
-    ]
+    cells = [[number(v, 5) if isinstance(v, float) else v for v in (row.get(c, "") for c in columns)] for row in rows]
+    return [table(columns, cells, "Poses that would separate the rivals best; as a table in next_poses.csv.", shown=8)]

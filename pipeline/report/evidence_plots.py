@@ -33,11 +33,27 @@ def evidence_figure(evidence: CauseEvidence, cause: str) -> Figure:
         means = _means(x[which], evidence.measured[which] * factor, evidence.sigma[which] * factor)
         if means is not None:
             data.append(
-                {"type": "scatter", "mode": "markers", "x": rounded(means[0]), "y": rounded(means[1]),
-                 "error_y": {"type": "data", "array": rounded(means[2]), "color": colour, "thickness": 2, "width": 4},
-                 "marker": {"color": colour, "size": 11, "line": {"color": "#fff", "width": 1.5}, "symbol": "square"},
-                 "name": f"mean of neighbours{told}"}
-            )  # fmt: skip
+                {
+                    "type": "scatter",
+                    "mode": "markers",
+                    "x": rounded(means[0]),
+                    "y": rounded(means[1]),
+                    "error_y": {
+                        "type": "data",
+                        "array": rounded(means[2]),
+                        "color": colour,
+                        "thickness": 2,
+                        "width": 4,
+                    },
+                    "marker": {
+                        "color": colour,
+                        "size": 11,
+                        "line": {"color": "#fff", "width": 1.5},
+                        "symbol": "square",
+                    },
+                    "name": f"mean of neighbours{told}",
+                }
+            )
     data += _law(evidence, x, factor)
     label_y = f"{what} ({unit})" if unit else what
     spread = np.concatenate([evidence.measured, evidence.fitted]) * factor
@@ -89,16 +105,27 @@ def abscissa(name: str, values: Array) -> tuple[Array, str]:
     return values, label(name)
 
 
-def _points(e: CauseEvidence, mine: Array, x: Array, factor: float, colour: str, symbol: str, name: str,
-            unit: str) -> dict[str, Any]:  # fmt: skip
+def _points(
+    e: CauseEvidence, mine: Array, x: Array, factor: float, colour: str, symbol: str, name: str, unit: str
+) -> dict[str, Any]:
     return {
-        "type": "scatter", "mode": "markers", "x": rounded(x[mine]), "y": rounded(e.measured[mine] * factor),
-        "error_y": {"type": "data", "array": rounded(e.sigma[mine] * factor), "color": colour, "thickness": 0.6,
-                    "width": 0},
-        "marker": {"color": colour, "size": 6, "symbol": symbol, "opacity": 0.55}, "name": name,
+        "type": "scatter",
+        "mode": "markers",
+        "x": rounded(x[mine]),
+        "y": rounded(e.measured[mine] * factor),
+        "error_y": {
+            "type": "data",
+            "array": rounded(e.sigma[mine] * factor),
+            "color": colour,
+            "thickness": 0.6,
+            "width": 0,
+        },
+        "marker": {"color": colour, "size": 6, "symbol": symbol, "opacity": 0.55},
+        "name": name,
         "text": [label(p) for p, m in zip(e.poses, mine, strict=True) if m],
-        "hovertemplate": "%{text}: %{y:.4g} " + unit + "<extra></extra>", "showlegend": symbol == "circle",
-    }  # fmt: skip
+        "hovertemplate": "%{text}: %{y:.4g} " + unit + "<extra></extra>",
+        "showlegend": symbol == "circle",
+    }
 
 
 def _means(x: Array, y: Array, sigma: Array) -> tuple[Array, Array, Array] | None:
@@ -135,12 +162,27 @@ def _law(e: CauseEvidence, x: Array, factor: float) -> list[dict[str, Any]]:
         told = f"fitted law, {_STATES[float(state)][1]}" if state else "fitted law"
         colour = _STATES[float(state)][0] if state else ACCENT
         line = {"color": INK if not state else colour, "width": 3, "dash": dashes[k % 3]}
-        out.append({"type": "scatter", "mode": "lines", "x": rounded(shown, 5), "y": rounded(value * factor),
-                    "name": told, "line": line})  # fmt: skip
+        out.append(
+            {
+                "type": "scatter",
+                "mode": "lines",
+                "x": rounded(shown, 5),
+                "y": rounded(value * factor),
+                "name": told,
+                "line": line,
+            }
+        )
     if not out:
         order = np.argsort(x, kind="stable")
         mark = {"color": GREEN, "symbol": "line-ew-open", "size": 12, "line": {"width": 2.5}}
-        out.append({"type": "scatter", "mode": "markers", "x": rounded(x[order]),
-                    "y": rounded(e.fitted[order] * factor), "name": "fitted law at the pose",
-                    "marker": mark})  # fmt: skip
+        out.append(
+            {
+                "type": "scatter",
+                "mode": "markers",
+                "x": rounded(x[order]),
+                "y": rounded(e.fitted[order] * factor),
+                "name": "fitted law at the pose",
+                "marker": mark,
+            }
+        )
     return out

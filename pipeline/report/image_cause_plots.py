@@ -34,16 +34,40 @@ def lens_figure(name: str, camera: Camera, covariance: Array, marks: Array) -> F
     band = {"type": "scatter", "mode": "lines", "line": {"width": 0}, "showlegend": False, "hoverinfo": "skip"}
     data: list[dict[str, Any]] = [
         {**band, "x": x, "y": rounded(shift - 2 * sigma)},
-        {**band, "x": x, "y": rounded(shift + 2 * sigma), "fill": "tonexty", "fillcolor": "rgba(0,114,178,0.22)",
-         "name": "two sigma", "showlegend": True},
-        {"type": "scatter", "mode": "lines", "x": x, "y": rounded(shift), "name": "identified",
-         "line": {"color": AFTER, "width": 3}},
-        {"type": "scatter", "mode": "lines", "x": [x[0], x[-1]], "y": [0, 0], "name": "camera file",
-         "line": {"color": BEFORE, "width": 2, "dash": "dash"}},
-    ]  # fmt: skip
+        {
+            **band,
+            "x": x,
+            "y": rounded(shift + 2 * sigma),
+            "fill": "tonexty",
+            "fillcolor": "rgba(0,114,178,0.22)",
+            "name": "two sigma",
+            "showlegend": True,
+        },
+        {
+            "type": "scatter",
+            "mode": "lines",
+            "x": x,
+            "y": rounded(shift),
+            "name": "identified",
+            "line": {"color": AFTER, "width": 3},
+        },
+        {
+            "type": "scatter",
+            "mode": "lines",
+            "x": [x[0], x[-1]],
+            "y": [0, 0],
+            "name": "camera file",
+            "line": {"color": BEFORE, "width": 2, "dash": "dash"},
+        },
+    ]
     told = f"Radial distortion of {label(name)} out to the outermost target: the camera file has none, the images do."
-    return Figure(tuple(data), layout("distance from the principal point (px)", "radial shift (px)"), told,
-                  f"Radial distortion of {name}", height=320)  # fmt: skip
+    return Figure(
+        tuple(data),
+        layout("distance from the principal point (px)", "radial shift (px)"),
+        told,
+        f"Radial distortion of {name}",
+        height=320,
+    )
 
 
 def gains_figure(
@@ -56,20 +80,44 @@ def gains_figure(
         return None
     y = [f"{k}. {label(n)}" for k, (n, _) in enumerate(held, 1)]
     data = tuple(
-        {"type": "bar", "orientation": "h", "y": y, "x": rounded([h[kind] for _, h in held]), "name": name,
-         "marker": {"color": colour}, "text": [number(h[kind]) for _, h in held], "textposition": "outside",
-         "cliponaxis": False}
+        {
+            "type": "bar",
+            "orientation": "h",
+            "y": y,
+            "x": rounded([h[kind] for _, h in held]),
+            "name": name,
+            "marker": {"color": colour},
+            "text": [number(h[kind]) for _, h in held],
+            "textposition": "outside",
+            "cliponaxis": False,
+        }
         for kind, name, colour in (("after", "with it", AFTER), ("before", "without it", BEFORE))
-    )  # fmt: skip
+    )
     shapes = []
     if floor:
-        shapes = [{"type": "line", "yref": "paper", "y0": 0, "y1": 1, "x0": floor, "x1": floor,
-                   "line": {"color": GREY, "dash": "dash"}}]  # fmt: skip
+        shapes = [
+            {
+                "type": "line",
+                "yref": "paper",
+                "y0": 0,
+                "y1": 1,
+                "x0": floor,
+                "x1": floor,
+                "line": {"color": GREY, "dash": "dash"},
+            }
+        ]
     return Figure(
         data,
-        layout(f"error ({unit}, RMS)", "", shapes=shapes, barmode="group", legend={"traceorder": "reversed"},
-               margin={"r": 60}, yaxis={"type": "category", "autorange": "reversed"}),
+        layout(
+            f"error ({unit}, RMS)",
+            "",
+            shapes=shapes,
+            barmode="group",
+            legend={"traceorder": "reversed"},
+            margin={"r": 60},
+            yaxis={"type": "category", "autorange": "reversed"},
+        ),
         "Error on kept-out data without and with each cause. Dashed: noise of the measurement.",
         "Error on kept-out data without and with each cause",
         height=130 + 62 * len(held),
-    )  # fmt: skip
+    )

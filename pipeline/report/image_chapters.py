@@ -33,10 +33,18 @@ def image_chapter(material: Material) -> Chapter:
         for source in dict.fromkeys(e.source for e in index.entries):
             entries = index.of(source)
             counts = np.array([e.targets for e in entries])
-            rows.append([source, str(len(entries)), f"{entries[0].size[0]} x {entries[0].size[1]}",
-                         f"{np.median(counts):.0f}", str(int(counts.min())),
-                         f"{np.median([e.codes for e in entries]):.0f}", str(sum(e.saturated for e in entries)),
-                         str(int(np.sum(counts == 0)))])  # fmt: skip
+            rows.append(
+                [
+                    source,
+                    str(len(entries)),
+                    f"{entries[0].size[0]} x {entries[0].size[1]}",
+                    f"{np.median(counts):.0f}",
+                    str(int(counts.min())),
+                    f"{np.median([e.codes for e in entries]):.0f}",
+                    str(sum(e.saturated for e in entries)),
+                    str(int(np.sum(counts == 0))),
+                ]
+            )
             order = np.argsort(counts, kind="stable")
             usual, poor = entries[int(order[len(order) // 2])], entries[int(order[0])]
             for entry, why in ((usual, "usual"), (poor, "fewest targets")):
@@ -44,9 +52,21 @@ def image_chapter(material: Material) -> Chapter:
                     picture = _picture(material, entry, why)
                     pictures += [picture] if picture is not None else []
         blocks.append(
-            table(["Images", "Number", "Size (px)", "Targets (median)", "fewest", "Codes read (median)",
-                   "Saturated targets", "Empty"], rows, text=(0, 2))
-        )  # fmt: skip
+            table(
+                [
+                    "Images",
+                    "Number",
+                    "Size (px)",
+                    "Targets (median)",
+                    "fewest",
+                    "Codes read (median)",
+                    "Saturated targets",
+                    "Empty",
+                ],
+                rows,
+                text=(0, 2),
+            )
+        )
         if pictures:
             blocks.append(
                 Pictures(
@@ -95,9 +115,17 @@ def drawn(grey: NDArray[np.uint8 | np.uint16], found: Detections, width: int = W
         read = found.code[i] >= 0
         colour = _BLUE if read else _SKY if found.code_state[i] == CodeState.UNREADABLE else _ORANGE
         cv2.ellipse(
-            canvas, (round(x * 16), round(y * 16)), (round(axes[0] * 16), round(axes[1] * 16)),
-            float(np.degrees(found.angle[i])), 0, 360, colour, 2, cv2.LINE_AA, 4,
-        )  # fmt: skip
+            canvas,
+            (round(x * 16), round(y * 16)),
+            (round(axes[0] * 16), round(axes[1] * 16)),
+            float(np.degrees(found.angle[i])),
+            0,
+            360,
+            colour,
+            2,
+            cv2.LINE_AA,
+            4,
+        )
         if read:
             at = (round(x + axes[0] + 3), round(y - axes[1] - 2))
             for ink, thick in (((0, 0, 0), 3), ((255, 255, 255), 1)):
@@ -153,23 +181,50 @@ def _vectors(name: str, xy: Array, residual: Array, size: tuple[int, int]) -> Fi
         ay += [round(float(a[1]), 1), round(float(b[1]), 1), None]
     told = [f"{c} marks, mean {number(m[0], 2)}, {number(m[1], 2)} px" for c, m in zip(counts, means, strict=True)]
     data: tuple[Mapping[str, object], ...] = (
-        {"type": "scatter", "mode": "lines", "x": x, "y": y, "name": f"residuals x {magnification:g}",
-         "line": {"color": GREY, "width": 1}, "hoverinfo": "skip", "opacity": 0.55},
-        {"type": "scatter", "mode": "lines", "x": ax, "y": ay, "name": f"mean of a region x {2 * magnification:g}",
-         "line": {"color": AFTER, "width": 3}, "hoverinfo": "skip"},
-        {"type": "scatter", "mode": "markers", "x": centres[:, 0].tolist(), "y": centres[:, 1].tolist(), "text": told,
-         "marker": {"size": 6, "color": AFTER}, "showlegend": False, "hovertemplate": "%{text}<extra></extra>"},
-    )  # fmt: skip
+        {
+            "type": "scatter",
+            "mode": "lines",
+            "x": x,
+            "y": y,
+            "name": f"residuals x {magnification:g}",
+            "line": {"color": GREY, "width": 1},
+            "hoverinfo": "skip",
+            "opacity": 0.55,
+        },
+        {
+            "type": "scatter",
+            "mode": "lines",
+            "x": ax,
+            "y": ay,
+            "name": f"mean of a region x {2 * magnification:g}",
+            "line": {"color": AFTER, "width": 3},
+            "hoverinfo": "skip",
+        },
+        {
+            "type": "scatter",
+            "mode": "markers",
+            "x": centres[:, 0].tolist(),
+            "y": centres[:, 1].tolist(),
+            "text": told,
+            "marker": {"size": 6, "color": AFTER},
+            "showlegend": False,
+            "hovertemplate": "%{text}<extra></extra>",
+        },
+    )
     shown = "" if len(rows) == len(xy) else f" ({len(rows)} of {len(xy)} drawn)"
     return Figure(
         data,
-        layout("x (px)", "y (px)", xaxis={"range": [0, size[0]], "constrain": "domain"},
-               yaxis={"range": [size[1], 0], "scaleanchor": "x", "constrain": "domain"}),
+        layout(
+            "x (px)",
+            "y (px)",
+            xaxis={"range": [0, size[0]], "constrain": "domain"},
+            yaxis={"range": [size[1], 0], "scaleanchor": "x", "constrain": "domain"},
+        ),
         f"{label(name)[:1].upper() + name[1:]}: {len(xy)} marks{shown}, {number(rms)} px RMS a coordinate.",
         f"Residual vectors of {name}",
         height=460,
         wide=False,
-    )  # fmt: skip
+    )
 
 
 def _field(xy: Array, residual: Array, size: tuple[int, int], across: int = 8) -> tuple[Array, Array, list[int]]:

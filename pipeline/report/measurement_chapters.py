@@ -38,8 +38,16 @@ def _lengths(pairs: PairDeviations) -> Figure:
         if not which.any():
             continue
         counts, _ = np.histogram(np.clip(deviation[which], -top, top), edges)
-        data.append({"type": "bar", "x": rounded(0.5 * (edges[1:] + edges[:-1])), "y": counts.tolist(), "name": name,
-                     "width": float(edges[1] - edges[0]), "marker": {"color": colour}})  # fmt: skip
+        data.append(
+            {
+                "type": "bar",
+                "x": rounded(0.5 * (edges[1:] + edges[:-1])),
+                "y": counts.tolist(),
+                "name": name,
+                "width": float(edges[1] - edges[0]),
+                "marker": {"color": colour},
+            }
+        )
     lines = [
         {"type": "line", "yref": "paper", "y0": 0, "y1": 1, "x0": x, "x1": x, "line": {"color": GREY, "dash": "dash"}}
         for x in (-limit, limit)
@@ -65,10 +73,13 @@ def _numbers(frames: MeasuredFrames, points: int) -> Block:
         ["points measured", str(points), f"{len(frames.rejected_points)} rejected"],
         ["poses measured", str(len(frames.pose)), f"{len(frames.rejected_poses)} rejected"],
         ["method", ", ".join(f"{k}: {v}" for k, v in methods.items()), ""],
-        ["length deviation (mm)", number(deviation.mean()) if len(deviation) else "–",
-         f"largest {number(deviation.max())}" if len(deviation) else ""],
+        [
+            "length deviation (mm)",
+            number(deviation.mean()) if len(deviation) else "–",
+            f"largest {number(deviation.max())}" if len(deviation) else "",
+        ],
         ["sigma of a position (mm)", number(np.median(own)), f"with what all poses share {number(np.median(both))}"],
         ["sigma of an orientation (deg)", number(np.median(turn)), ""],
         ["scatter of lengths / stated", number(frames.noise_factor), "one where the stated covariance holds"],
-    ]  # fmt: skip
+    ]
     return table(["Measured poses", "Value", ""], rows, text=(0, 2))

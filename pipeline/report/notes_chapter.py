@@ -26,8 +26,10 @@ def rejected_chapter(material: Material) -> Chapter:
             for i in facts["outliers"]
         ]
     if material.diagnosis:
-        items += [f"pose {p}: an observation is a gross error, left out of the diagnosis"
-                  for p in material.diagnosis.get("blunders", [])]  # fmt: skip
+        items += [
+            f"pose {p}: an observation is a gross error, left out of the diagnosis"
+            for p in material.diagnosis.get("blunders", [])
+        ]
     if material.station is not None:
         for mark in material.station.rejected:
             what = "whole image" if mark.target < 0 else f"target {mark.target}"
@@ -80,11 +82,13 @@ def files_chapter(material: Material) -> Chapter:
     if run.robot.is_file():
         commands = [
             ["pipeline compensate RUN --frames wanted.csv --out q.csv", "joint angles that bring the real tool there"],
-            ["pipeline compensate RUN --frames wanted.csv --out targets.csv --as frames --in base",
-             "corrected Cartesian targets, which most controllers load"],
+            [
+                "pipeline compensate RUN --frames wanted.csv --out targets.csv --as frames --in base",
+                "corrected Cartesian targets, which most controllers load",
+            ],
             ["pipeline export RUN --c controller/ --urdf robot.urdf", "C99 for the controller; geometry as URDF"],
             ["pipeline predict RUN --poses poses.csv --out frames.csv", "where the tool really is, with sigmas"],
-        ]  # fmt: skip
+        ]
         blocks.append(table(["Command", "Gives"], commands, "What to load into the controller.", text=(0, 1)))
     seconds = [[name, number(value)] for name, value in material.timing.items()]
     blocks.append(table(["Stage", "Seconds"], seconds, "Time of the stages."))

@@ -25,14 +25,18 @@ def render(name: str, verdict: Verdict, chapters: Sequence[Chapter], source: Pro
     """
     figures = any(isinstance(b, Figure) for chapter in chapters for b in chapter.blocks)
     scripts = [*([get_plotlyjs()] if figures else []), _text("report.js")]
-    return _environment().get_template("report.html").render(
-        name=name,
-        verdict=verdict,
-        chapters=chapters,
-        source=source,
-        style=Markup(_text("style.css")),
-        scripts=[Markup(script) for script in scripts],
-        hashes=[_hash(script) for script in scripts],
+    return (
+        _environment()
+        .get_template("report.html")
+        .render(
+            name=name,
+            verdict=verdict,
+            chapters=chapters,
+            source=source,
+            style=Markup(_text("style.css")),
+            scripts=[Markup(script) for script in scripts],
+            hashes=[_hash(script) for script in scripts],
+        )
     )
 
 

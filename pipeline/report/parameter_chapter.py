@@ -57,13 +57,24 @@ def _parameters(calibrated: Any) -> Table:
         spread, _ = in_units(model, name, float(s))
         ratio = abs(theta) / s if s > 0 else float("inf")
         unit = "SI" if not unit and name.split(".")[0] in terms else unit
-        rows.append([name, to_sigma(value, spread), number(spread, 2), unit,
-                     f"{ratio:.1f}" if np.isfinite(ratio) else "–", "●" if ratio > 3 else ""])  # fmt: skip
+        rows.append(
+            [
+                name,
+                to_sigma(value, spread),
+                number(spread, 2),
+                unit,
+                f"{ratio:.1f}" if np.isfinite(ratio) else "–",
+                "●" if ratio > 3 else "",
+            ]
+        )
     return table(
-        ["Parameter", "Value", "Sigma", "Unit", "Value / sigma", "Significant"], rows,
+        ["Parameter", "Value", "Sigma", "Unit", "Value / sigma", "Significant"],
+        rows,
         "Elastic parameters in degrees per kN m of static moment. "
-        "Base and tool are given as frames below, their deviations are folded in.", text=(0, 3, 5), shown=80,
-    )  # fmt: skip
+        "Base and tool are given as frames below, their deviations are folded in.",
+        text=(0, 3, 5),
+        shown=80,
+    )
 
 
 def _placements(model: RobotModel) -> Table:
@@ -79,12 +90,21 @@ def _placements(model: RobotModel) -> Table:
 
 def _terms(model: RobotModel) -> Table:
     rows = [
-        [t.name, t.cause or "", f"{t.frame} {t.kind}", _readable(t.expression),
-         ", ".join(f"{k} = {number(v, 4)}" for k, v in t.parameters.items())]
+        [
+            t.name,
+            t.cause or "",
+            f"{t.frame} {t.kind}",
+            _readable(t.expression),
+            ", ".join(f"{k} = {number(v, 4)}" for k, v in t.parameters.items()),
+        ]
         for t in model.terms
-    ]  # fmt: skip
-    return table(["Term", "Cause", "Added to", "Expression (SI)", "Parameters (SI)"], rows,
-                 "Physics that the diagnosis added to the model.", text=(0, 1, 2, 3, 4))  # fmt: skip
+    ]
+    return table(
+        ["Term", "Cause", "Added to", "Expression (SI)", "Parameters (SI)"],
+        rows,
+        "Physics that the diagnosis added to the model.",
+        text=(0, 1, 2, 3, 4),
+    )
 
 
 def _readable(expression: str) -> str:
@@ -108,10 +128,14 @@ def _gauges(facts: Any, diagnosed: bool) -> list[Block]:
     blocks.append(Text(f"Before the diagnosis added its terms: {sentence}" if diagnosed else sentence))
     if rows:
         blocks.append(
-            table(["Eliminated", "Why", "Tied to (does the same as)"], rows,
-                  "Eliminated parameters stay at their nominal values; nothing is lost within the measured poses.",
-                  text=(0, 1, 2), shown=12)
-        )  # fmt: skip
+            table(
+                ["Eliminated", "Why", "Tied to (does the same as)"],
+                rows,
+                "Eliminated parameters stay at their nominal values; nothing is lost within the measured poses.",
+                text=(0, 1, 2),
+                shown=12,
+            )
+        )
     correlation = np.asarray(facts["correlations"])
     if correlation.ndim == 2 and len(correlation):
         names = facts["names"]
@@ -120,8 +144,12 @@ def _gauges(facts: Any, diagnosed: bool) -> list[Block]:
         pairs = [[names[i[k]], names[j[k]], f"{correlation[i[k], j[k]]:+.3f}"] for k in order]
         if pairs:
             blocks.append(
-                table(["Parameter", "Hard to tell from", "Correlation"], pairs,
-                      "Correlations above 0.95: their sum or difference is known much better than each.", text=(0, 1),
-                      shown=12)
-            )  # fmt: skip
+                table(
+                    ["Parameter", "Hard to tell from", "Correlation"],
+                    pairs,
+                    "Correlations above 0.95: their sum or difference is known much better than each.",
+                    text=(0, 1),
+                    shown=12,
+                )
+            )
     return blocks

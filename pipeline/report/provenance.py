@@ -45,8 +45,11 @@ def provenance(material: Material) -> Provenance:
     inputs = [(_short(path, material.campaign_folder), material.run.hash(path)) for path in campaign.files]
     index = material.detections
     if index is not None:
-        inputs += [(_short(e.path, material.campaign_folder), material.run.hash(e.path)) for e in index.entries
-                   if e.path.is_file()]  # fmt: skip
+        inputs += [
+            (_short(e.path, material.campaign_folder), material.run.hash(e.path))
+            for e in index.entries
+            if e.path.is_file()
+        ]
     return Provenance(tuple(facts), tuple(dict.fromkeys(inputs)), settings)
 
 

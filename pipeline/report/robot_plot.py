@@ -69,8 +69,9 @@ def _pose(material: Material, causes: list[dict[str, Any]]) -> tuple[int, str]:
     return 0, material.pose_name(0)
 
 
-def _place(cause: dict[str, Any], model: RobotModel, chain: Chain, motion: Array, frames: Array,
-           tool: Array) -> tuple[Array, Array | None, str] | None:  # fmt: skip
+def _place(
+    cause: dict[str, Any], model: RobotModel, chain: Chain, motion: Array, frames: Array, tool: Array
+) -> tuple[Array, Array | None, str] | None:
     """Centre, direction and name of a place in base coordinates."""
     where, direction, stage = str(cause.get("where")), cause.get("direction"), cause.get("stage")
     if where.startswith("axis") and where[4:].isdigit() and 0 < int(where[4:]) <= chain.n_joints:
@@ -91,20 +92,43 @@ def _place(cause: dict[str, Any], model: RobotModel, chain: Chain, motion: Array
 
 
 def _line(points: Array, name: str, colour: str, width: int) -> dict[str, Any]:
-    return {"type": "scatter3d", "mode": "lines", "x": rounded(points[:, 0], 5), "y": rounded(points[:, 1], 5),
-            "z": rounded(points[:, 2], 5), "name": label(name), "line": {"color": colour, "width": width},
-            "hoverinfo": "skip", "showlegend": False}  # fmt: skip
+    return {
+        "type": "scatter3d",
+        "mode": "lines",
+        "x": rounded(points[:, 0], 5),
+        "y": rounded(points[:, 1], 5),
+        "z": rounded(points[:, 2], 5),
+        "name": label(name),
+        "line": {"color": colour, "width": width},
+        "hoverinfo": "skip",
+        "showlegend": False,
+    }
 
 
 def _dots(points: Array, name: str, colour: str, size: float, text: list[str] | None = None) -> dict[str, Any]:
-    return {"type": "scatter3d", "mode": "markers", "x": rounded(points[:, 0], 5), "y": rounded(points[:, 1], 5),
-            "z": rounded(points[:, 2], 5), "name": label(name), "marker": {"color": colour, "size": size},
-            "text": [label(t) for t in text or [name] * len(points)], "hovertemplate": "%{text}<extra></extra>",
-            "showlegend": False}  # fmt: skip
+    return {
+        "type": "scatter3d",
+        "mode": "markers",
+        "x": rounded(points[:, 0], 5),
+        "y": rounded(points[:, 1], 5),
+        "z": rounded(points[:, 2], 5),
+        "name": label(name),
+        "marker": {"color": colour, "size": size},
+        "text": [label(t) for t in text or [name] * len(points)],
+        "hovertemplate": "%{text}<extra></extra>",
+        "showlegend": False,
+    }
 
 
 def _note(data: list[dict[str, Any]], name: str) -> dict[str, Any]:
     mark = next(d for d in data if d["name"] == label(name) and d["mode"] == "markers")
     at = {axis: mark[axis][0] for axis in ("x", "y", "z")}
-    return {**at, "text": f"<b>{label(name)}</b>", "ax": 60, "ay": -50, "font": {"color": ACCENT, "size": 15},
-            "arrowcolor": ACCENT, "bgcolor": "rgba(255,255,255,0.85)"}  # fmt: skip
+    return {
+        **at,
+        "text": f"<b>{label(name)}</b>",
+        "ax": 60,
+        "ay": -50,
+        "font": {"color": ACCENT, "size": 15},
+        "arrowcolor": ACCENT,
+        "bgcolor": "rgba(255,255,255,0.85)",
+    }

@@ -64,8 +64,10 @@ def scene(data: Iterable[Mapping[str, Any]], up: Any = (0.0, 0.0, 1.0), **more: 
         "aspectmode": "manual",
         # the diagonal of the box has the same length on the screen whatever its shape, so nothing is cut off
         "aspectratio": dict(zip(xyz, rounded(_DIAGONAL * span / np.linalg.norm(span)), strict=True)),
-        **{f"{k}axis": axis | {"title": {"text": f"{k} (m)"}, "range": ends.tolist(), "nticks": 6}
-           for k, ends in zip(xyz, ranges, strict=True)},
+        **{
+            f"{k}axis": axis | {"title": {"text": f"{k} (m)"}, "range": ends.tolist(), "nticks": 6}
+            for k, ends in zip(xyz, ranges, strict=True)
+        },
         "camera": {
             "center": dict(zip(xyz, (-0.03 * z).tolist(), strict=True)),
             "eye": dict(zip(xyz, eye.tolist(), strict=True)),

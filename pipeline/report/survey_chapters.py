@@ -50,8 +50,11 @@ def _survey(name: str, survey: SurveyResult) -> list[Block]:
     blocks.append(_interior({f"survey of {name}": (n.camera, interior)}))
     if n.correlations:
         pairs = [[c.first, c.second, f"{c.value:+.3f}"] for c in sorted(n.correlations, key=lambda c: -abs(c.value))]
-        blocks.append(table(["Unknown", "Hard to tell from", "Correlation"], pairs, "Correlations above 0.95.",
-                            text=(0, 1), shown=8))  # fmt: skip
+        blocks.append(
+            table(
+                ["Unknown", "Hard to tell from", "Correlation"], pairs, "Correlations above 0.95.", text=(0, 1), shown=8
+            )
+        )
     if any(d > 1e-9 for _, d in survey.deviations):
         worst = sorted(survey.deviations, key=lambda d: -d[1])[:5]
         text = ", ".join(f"{number(d * 1e3)} mm at target {i}" for i, d in worst)
@@ -63,19 +66,31 @@ def _lengths(lengths: list[LengthResult]) -> list[Block]:
     if not lengths:
         return []
     rows = [
-        ["check length" if c.kind == "check" else "scale bar", f"{c.ids[0]} – {c.ids[1]}", f"{c.expected * 1e3:.3f}",
-         f"{c.error * 1e3:+.4f}", number(c.sigma * 1e3, 2) if c.sigma > 0 else "–",
-         f"{c.w:+.1f}" if c.sigma > 0 else "–"]
+        [
+            "check length" if c.kind == "check" else "scale bar",
+            f"{c.ids[0]} – {c.ids[1]}",
+            f"{c.expected * 1e3:.3f}",
+            f"{c.error * 1e3:+.4f}",
+            number(c.sigma * 1e3, 2) if c.sigma > 0 else "–",
+            f"{c.w:+.1f}" if c.sigma > 0 else "–",
+        ]
         for c in lengths
-    ]  # fmt: skip
+    ]
     checks = [abs(c.error) * 1e3 for c in lengths if c.kind == "check"]
     word = (
         f"Length measurement error E after VDI/VDE 2634-1: {number(max(checks))} mm over {len(checks)} check lengths."
         if checks
         else "There are no check lengths: give some to have the scale verified after VDI/VDE 2634-1."
     )
-    return [table(["Length", "Targets", "Known (mm)", "Error (mm)", "Sigma (mm)", "Error / sigma"], rows, word,
-                  text=(0, 1), shown=20)]  # fmt: skip
+    return [
+        table(
+            ["Length", "Targets", "Known (mm)", "Error (mm)", "Sigma (mm)", "Error / sigma"],
+            rows,
+            word,
+            text=(0, 1),
+            shown=20,
+        )
+    ]
 
 
 def _station(station: StationOrientation) -> list[Block]:
@@ -84,8 +99,15 @@ def _station(station: StationOrientation) -> list[Block]:
         marks = int(np.sum(station.marks.camera == c))
         epochs = int(np.sum(station.exterior_camera == c))
         refined = ", ".join(station.free_interior.get(name, ())) or "–"
-        rows.append([name, str(marks), number(station.noise.get(name)), refined,
-                     "stood still" if epochs == 1 else f"moved {epochs - 1} times"])  # fmt: skip
+        rows.append(
+            [
+                name,
+                str(marks),
+                number(station.noise.get(name)),
+                refined,
+                "stood still" if epochs == 1 else f"moved {epochs - 1} times",
+            ]
+        )
     told = (
         f"Station: {len(station.poses)} poses, redundancy {station.redundancy_total:.0f}, "
         f"sigma0 {number(station.sigma0)}, residuals {number(station.rms_px)} px RMS."
@@ -93,8 +115,10 @@ def _station(station: StationOrientation) -> list[Block]:
     blocks: list[Block] = [
         table(["Camera", "Marks", "Scatter / stated", "Refined", "Stand"], rows, told, text=(0, 3, 4))
     ]
-    sigmas = {name: (camera, np.sqrt(np.clip(np.diag(station.camera_covariance(name)[1]), 0, None)))
-              for name, camera in zip(station.names, station.cameras, strict=True)}  # fmt: skip
+    sigmas = {
+        name: (camera, np.sqrt(np.clip(np.diag(station.camera_covariance(name)[1]), 0, None)))
+        for name, camera in zip(station.names, station.cameras, strict=True)
+    }
     blocks.append(_interior(sigmas))
     return blocks
 
@@ -141,15 +165,30 @@ def _camera_lines(world_T_camera: Array, size: float) -> tuple[list[float | None
 
 
 def _lines(xyz: tuple[list[float | None], ...], name: str, colour: str, width: int = 2) -> dict[str, object]:
-    return {"type": "scatter3d", "mode": "lines", "x": xyz[0], "y": xyz[1], "z": xyz[2], "name": name,
-            "line": {"color": colour, "width": width}, "hoverinfo": "skip"}  # fmt: skip
+    return {
+        "type": "scatter3d",
+        "mode": "lines",
+        "x": xyz[0],
+        "y": xyz[1],
+        "z": xyz[2],
+        "name": name,
+        "line": {"color": colour, "width": width},
+        "hoverinfo": "skip",
+    }
 
 
 def _dots(points: Array, text: list[str], name: str, colour: str, size: float = 3) -> dict[str, object]:
-    return {"type": "scatter3d", "mode": "markers", "x": rounded(points[:, 0], 6), "y": rounded(points[:, 1], 6),
-            "z": rounded(points[:, 2], 6), "name": name, "text": [label(t) for t in text],
-            "marker": {"size": size, "color": colour},
-            "hovertemplate": "%{text}<extra>" + label(name) + "</extra>"}  # fmt: skip
+    return {
+        "type": "scatter3d",
+        "mode": "markers",
+        "x": rounded(points[:, 0], 6),
+        "y": rounded(points[:, 1], 6),
+        "z": rounded(points[:, 2], 6),
+        "name": name,
+        "text": [label(t) for t in text],
+        "marker": {"size": size, "color": colour},
+        "hovertemplate": "%{text}<extra>" + label(name) + "</extra>",
+    }
 
 
 def _network(name: str, network: CameraNetwork) -> Figure:
@@ -172,10 +211,14 @@ def _station_scene(station: StationOrientation, material: Material) -> Figure:
     stands = station.world_T_exterior
     extent = float(np.median(np.linalg.norm(centres - stands[0][:3, 3], axis=1)))
     data = [
-        _lines(_camera_lines(stands[station.exterior_camera == c], 0.06 * extent), f"camera {name}",
-               CATEGORIES[c % len(CATEGORIES)], 4)
+        _lines(
+            _camera_lines(stands[station.exterior_camera == c], 0.06 * extent),
+            f"camera {name}",
+            CATEGORIES[c % len(CATEGORIES)],
+            4,
+        )
         for c, name in enumerate(map(label, station.names))
-    ]  # fmt: skip
+    ]
     body = station.body.points[station.body.known] if hasattr(station.body, "known") else station.body.points
     targets = (body @ np.swapaxes(station.world_T_body[:, :3, :3], 1, 2) + centres[:, None]).reshape(-1, 3)
     data.append(_dots(targets, [""] * len(targets), "targets in all poses", GREY, 1.5))
@@ -184,8 +227,13 @@ def _station_scene(station: StationOrientation, material: Material) -> Figure:
     up = -stands[0][:3, 1]
     if material.calibrated is not None and material.calibrated.model.world_T_base is not None:
         up = np.asarray(material.calibrated.model.world_T_base)[:3, 2]
-    return Figure(tuple(data), scene(data, up), "The station: cameras, and the body's place in every pose.",
-                  "Station cameras and measured poses in space", height=520)  # fmt: skip
+    return Figure(
+        tuple(data),
+        scene(data, up),
+        "The station: cameras, and the body's place in every pose.",
+        "Station cameras and measured poses in space",
+        height=520,
+    )
 
 
 def _poses_scene(frames: Array, names: list[str]) -> Figure:
@@ -199,5 +247,10 @@ def _poses_scene(frames: Array, names: list[str]) -> Figure:
             for i in range(3)
         )
         data.append(_lines(line, f"{'xyz'[k]} axis", colour, 3))
-    return Figure(tuple(data), scene(data), "The body's measured poses in the measuring system.",
-                  "Measured poses in space", height=480)  # fmt: skip
+    return Figure(
+        tuple(data),
+        scene(data),
+        "The body's measured poses in the measuring system.",
+        "Measured poses in space",
+        height=480,
+    )

@@ -25,8 +25,14 @@ def verdict_of(material: Material) -> Verdict:
     if material.surveys or material.station is not None:
         return _measuring(material)
     if material.stages:
-        return Verdict("none", "No verdict", "The run holds no verified robot and no survey.",
-                       "See the chapters below.", "Nothing yet.", told_diagnosis(material))  # fmt: skip
+        return Verdict(
+            "none",
+            "No verdict",
+            "The run holds no verified robot and no survey.",
+            "See the chapters below.",
+            "Nothing yet.",
+            told_diagnosis(material),
+        )
     return Verdict("none", "Nothing done yet", "No stage of this campaign has finished.", "–", "Nothing yet.")
 
 
@@ -92,9 +98,15 @@ def _robot(material: Material, v: Verification) -> Verdict:
     if grade == "bad":
         load = "Keep the nominal robot until the doubts are settled."
     return Verdict(
-        grade, word, f"{change}{but}.", reason, load, told_diagnosis(material), _keys(material, v, noise, gain),
+        grade,
+        word,
+        f"{change}{but}.",
+        reason,
+        load,
+        told_diagnosis(material),
+        _keys(material, v, noise, gain),
         error_table(v, noise, full=False),
-    )  # fmt: skip
+    )
 
 
 def _taken_out(material: Material, v: Verification) -> str:
@@ -123,18 +135,32 @@ def _taken_out(material: Material, v: Verification) -> str:
 def _keys(material: Material, v: Verification, noise: dict[str, float], gain: float) -> tuple[KeyFigure, ...]:
     after, before = v.tools["0"], v.nominal["0"] if v.nominal else None
     keys = [
-        KeyFigure(number(after.mean * 1e3), "mm", "Mean error after calibration",
-                  f"before {number(before.mean * 1e3)} mm" if before else ""),
-        KeyFigure(number(after.max * 1e3), "mm", "Largest error after",
-                  f"before {number(before.max * 1e3)} mm" if before else ""),
-    ]  # fmt: skip
+        KeyFigure(
+            number(after.mean * 1e3),
+            "mm",
+            "Mean error after calibration",
+            f"before {number(before.mean * 1e3)} mm" if before else "",
+        ),
+        KeyFigure(
+            number(after.max * 1e3),
+            "mm",
+            "Largest error after",
+            f"before {number(before.max * 1e3)} mm" if before else "",
+        ),
+    ]
     if np.isfinite(gain):
         keys.append(KeyFigure(f"{gain:.1f}", "times", "Improvement", f"over {v.poses} poses"))
     if "0" in noise:
         keys.append(KeyFigure(number(noise["0"] * 1e3), "mm", "Noise of the measurement", "RMS of a measured pose"))
     if v.iso is not None:
-        keys.append(KeyFigure(number(v.iso.ap_mean * 1e3), "mm", "AP, ISO 9283",
-                              f"largest {number(v.iso.ap_max * 1e3)} mm, {v.iso.groups} poses"))  # fmt: skip
+        keys.append(
+            KeyFigure(
+                number(v.iso.ap_mean * 1e3),
+                "mm",
+                "AP, ISO 9283",
+                f"largest {number(v.iso.ap_max * 1e3)} mm, {v.iso.groups} poses",
+            )
+        )
     return tuple(keys)
 
 
@@ -156,8 +182,14 @@ def _measuring(material: Material) -> Verdict:
         ]
         if n.check_lengths:
             worst = max(n.check_lengths, key=lambda c: abs(c.error))
-            keys.append(KeyFigure(number(abs(worst.error) * 1e3), "mm", "Length error, VDI/VDE 2634-1",
-                                  f"largest of {len(n.check_lengths)} check lengths"))  # fmt: skip
+            keys.append(
+                KeyFigure(
+                    number(abs(worst.error) * 1e3),
+                    "mm",
+                    "Length error, VDI/VDE 2634-1",
+                    f"largest of {len(n.check_lengths)} check lengths",
+                )
+            )
             reasons.append(f"{len(n.check_lengths)} check lengths took no part in the adjustment")
             if any(abs(c.w) > 3.3 for c in n.check_lengths):
                 grade = "care"
@@ -175,8 +207,14 @@ def _measuring(material: Material) -> Verdict:
             keys.append(KeyFigure(number(own), "mm", "Sigma of a measured place", count))
             deviation = np.abs(frames.pairs.deviation) * 1e3
             if len(deviation):
-                keys.append(KeyFigure(number(deviation.mean()), "mm", "Deviation of lengths between targets",
-                                      f"largest {number(deviation.max())} mm of {len(deviation)}"))  # fmt: skip
+                keys.append(
+                    KeyFigure(
+                        number(deviation.mean()),
+                        "mm",
+                        "Deviation of lengths between targets",
+                        f"largest {number(deviation.max())} mm of {len(deviation)}",
+                    )
+                )
         parts.append(oriented)
         keys.append(KeyFigure(number(station.rms_px), "px", "Residuals of the station", "RMS"))
         reasons.append(f"redundancy {station.redundancy_total:.0f} of the station, sigma0 {number(station.sigma0)}")
@@ -190,8 +228,12 @@ def _measuring(material: Material) -> Verdict:
         parts.append("but the images show something that the camera model does not explain")
     word = {"good": "Good", "care": "Usable, with care", "bad": "Not usable"}.get(grade, "")
     return Verdict(
-        grade, word, _sentence(parts), _sentence(reasons),
+        grade,
+        word,
+        _sentence(parts),
+        _sentence(reasons),
         ("bodies/*.yaml (surveyed coordinates with sigmas) and " if material.surveys else "")
         + "cameras/*.yaml (calibrated cameras).",
-        told_diagnosis(material), tuple(keys),
-    )  # fmt: skip
+        told_diagnosis(material),
+        tuple(keys),
+    )

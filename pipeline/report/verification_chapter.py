@@ -59,12 +59,15 @@ def error_table(verification: Verification, noise: Mapping[str, float], *, full:
             if name in noise:
                 rows.append([place, "noise of the measurement alone", "", "", "", "", floor])
             continue
-        pair = [(number(getattr(before, k) * mm) if before else "–", number(getattr(after, k) * mm))
-                for k in ("mean", "max", "rms")]  # fmt: skip
+        pair = [
+            (number(getattr(before, k) * mm) if before else "–", number(getattr(after, k) * mm))
+            for k in ("mean", "max", "rms")
+        ]
         rows.append([place, *(v for both in pair for v in both), floor])
     if full:
-        return table(["Error in mm at", "", "Mean", "Smallest", "Largest", "Spread", "RMS"], rows, text=(0, 1),
-                     emphasis=(2,))  # fmt: skip
+        return table(
+            ["Error in mm at", "", "Mean", "Smallest", "Largest", "Spread", "RMS"], rows, text=(0, 1), emphasis=(2,)
+        )
     pairs = [c for kind in ("Mean", "Largest", "RMS") for c in (f"{kind} before", "after")]
     columns = ["Error in mm at", *pairs, "noise (RMS)"]
     return table(columns, rows, emphasis=(2, 4, 6))
@@ -115,24 +118,47 @@ def _bars(v: Verification, names: list[str]) -> Figure:
     if v.nominal_errors is not None and len(v.nominal_errors["0"]) == len(errors):
         data.append(_bar(order, v.nominal_errors["0"] * 1000, "before (nominal, best cell)", BEFORE))
     data.append(_bar(order, errors, "after (calibrated)", AFTER))
-    buttons = [{"label": told, "method": "relayout", "args": [{"yaxis.type": kind}]}
-               for told, kind in (("linear", "linear"), ("logarithmic", "log"))]  # fmt: skip
-    menu = {"type": "buttons", "direction": "right", "x": 1, "xanchor": "right", "y": 1.02, "yanchor": "bottom",
-            "buttons": buttons, "showactive": True, "bgcolor": "#fff"}  # fmt: skip
+    buttons = [
+        {"label": told, "method": "relayout", "args": [{"yaxis.type": kind}]}
+        for told, kind in (("linear", "linear"), ("logarithmic", "log"))
+    ]
+    menu = {
+        "type": "buttons",
+        "direction": "right",
+        "x": 1,
+        "xanchor": "right",
+        "y": 1.02,
+        "yanchor": "bottom",
+        "buttons": buttons,
+        "showactive": True,
+        "bgcolor": "#fff",
+    }
     return Figure(
         tuple(data),
-        layout("pose", "error (mm)", barmode="group", bargap=0.25, xaxis={"type": "category", "nticks": 30},
-               updatemenus=[menu]),
+        layout(
+            "pose",
+            "error (mm)",
+            barmode="group",
+            bargap=0.25,
+            xaxis={"type": "category", "nticks": 30},
+            updatemenus=[menu],
+        ),
         "Error at the tool's origin, pose by pose.",
         "Bars: error of each pose before and after calibration",
-    )  # fmt: skip
+    )
 
 
 def _bar(x: list[str], y: Array, name: str, colour: str) -> dict[str, object]:
     # several points of one pose follow one another: each gets a bar of its own place
     x = x if len(x) == len(y) else [str(i + 1) for i in range(len(y))]
-    return {"type": "bar", "x": x, "y": rounded(y), "name": name, "marker": {"color": colour},
-            "hovertemplate": "%{x}: %{y:.3f} mm<extra>" + name + "</extra>"}  # fmt: skip
+    return {
+        "type": "bar",
+        "x": x,
+        "y": rounded(y),
+        "name": name,
+        "marker": {"color": colour},
+        "hovertemplate": "%{x}: %{y:.3f} mm<extra>" + name + "</extra>",
+    }
 
 
 def _histogram(v: Verification) -> Figure:
@@ -149,20 +175,29 @@ def _histogram(v: Verification) -> Figure:
         for name, errors, colour in groups:
             counts, _ = np.histogram(np.clip(errors[tool] * 1000, edges[0], edges[-1]), edges)
             data.append(
-                {"type": "bar", "x": rounded(np.sqrt(edges[1:] * edges[:-1])), "y": counts.tolist(),
-                 "width": rounded(np.diff(edges)), "name": f"{name}, {_tool(tool, v)}",
-                 "marker": {"color": colour, "opacity": 0.8, "line": {"width": 0.5, "color": "#fff"}},
-                 "visible": True if k == 0 else "legendonly"}
-            )  # fmt: skip
+                {
+                    "type": "bar",
+                    "x": rounded(np.sqrt(edges[1:] * edges[:-1])),
+                    "y": counts.tolist(),
+                    "width": rounded(np.diff(edges)),
+                    "name": f"{name}, {_tool(tool, v)}",
+                    "marker": {"color": colour, "opacity": 0.8, "line": {"width": 0.5, "color": "#fff"}},
+                    "visible": True if k == 0 else "legendonly",
+                }
+            )
     more = "; other tool points by a click in the legend" if len(v.errors) > 1 else ""
     return Figure(
         tuple(data),
-        layout("error (mm), logarithmic", "poses", barmode="overlay",
-               xaxis={"type": "log", "dtick": "D2" if high - low < 1.5 else 1}),
+        layout(
+            "error (mm), logarithmic",
+            "poses",
+            barmode="overlay",
+            xaxis={"type": "log", "dtick": "D2" if high - low < 1.5 else 1},
+        ),
         f"Distribution of the errors{more}.",
         "Histogram of pose errors before and after calibration",
         height=320,
-    )  # fmt: skip
+    )
 
 
 def _iso(v: Verification) -> Table:
@@ -171,36 +206,55 @@ def _iso(v: Verification) -> Table:
         raise ValueError("no ISO terms")
     rows = [
         ["AP, pose accuracy of position", number(iso.ap_mean * 1e3), number(iso.ap_max * 1e3), "mm"],
-        ["AP, pose accuracy of orientation", number(np.degrees(iso.ap_orientation_mean)),
-         number(np.degrees(iso.ap_orientation_max)), "deg"],
+        [
+            "AP, pose accuracy of orientation",
+            number(np.degrees(iso.ap_orientation_mean)),
+            number(np.degrees(iso.ap_orientation_max)),
+            "deg",
+        ],
         ["RP, repeatability of position", number(iso.rp_mean * 1e3), number(iso.rp_max * 1e3), "mm"],
-    ]  # fmt: skip
+    ]
     note = "" if np.isfinite(iso.rp_mean) else " RP needs repeated poses, there are none."
     return table(
-        ["Term of ISO 9283", "Mean of the poses", "Largest", "Unit"], rows,
-        f"Model against the barycentre of what was attained in {iso.groups} distinct poses.{note}", text=(0, 3),
-    )  # fmt: skip
+        ["Term of ISO 9283", "Mean of the poses", "Largest", "Unit"],
+        rows,
+        f"Model against the barycentre of what was attained in {iso.groups} distinct poses.{note}",
+        text=(0, 3),
+    )
 
 
 def _calibration_of_uncertainty(v: Verification, names: list[str]) -> Figure:
     size = np.sqrt(v.normalised)
     x = [label(n) for n in names] if len(names) == len(size) else list(range(len(size)))
     data = [
-        {"type": "scatter", "mode": "markers", "x": x, "y": rounded(size), "name": "pose",
-         "marker": {"color": AFTER, "size": 8}, "hovertemplate": "%{x}: %{y:.2f}<extra></extra>"},
-    ]  # fmt: skip
+        {
+            "type": "scatter",
+            "mode": "markers",
+            "x": x,
+            "y": rounded(size),
+            "name": "pose",
+            "marker": {"color": AFTER, "size": 8},
+            "hovertemplate": "%{x}: %{y:.2f}<extra></extra>",
+        }
+    ]
     lines = [
         {"type": "line", "xref": "paper", "x0": 0, "x1": 1, "y0": 1, "y1": 1, "line": {"color": GREY, "dash": "dash"}}
     ]
     return Figure(
         tuple(data),
-        layout("pose", "error / predicted error", shapes=lines, yaxis={"rangemode": "tozero"},
-               xaxis={"type": "category", "nticks": 30}, showlegend=False),
+        layout(
+            "pose",
+            "error / predicted error",
+            shapes=lines,
+            yaxis={"rangemode": "tozero"},
+            xaxis={"type": "category", "nticks": 30},
+            showlegend=False,
+        ),
         "Predicted against actual: error of each pose divided by what the covariance of model and measurement "
         "predicts. Around one: the stated uncertainties hold.",
         "Normalised error of each pose",
         height=280,
-    )  # fmt: skip
+    )
 
 
 def _honesty(v: Verification) -> str:

@@ -46,9 +46,7 @@ def corrected(
     def displaced(o: RobotObservations) -> RobotObservations:
         rows = Recording(poses.q, poses.payload, _covariates(poses), poses.names, o)
         inputs = rows.inputs(kernel)
-        data = observation_data(
-            rows, kernel.frames(kernel.theta0, inputs), kernel.variables(kernel.theta0, inputs)
-        )
+        data = observation_data(rows, kernel.frames(kernel.theta0, inputs), kernel.variables(kernel.theta0, inputs))
         shift = sum((f.family.displace(data, f.constants) @ f.values for f in found if f.family.displace), np.zeros(()))
         if isinstance(o, FrameObservations):
             return dataclasses.replace(o, world_T_tool=retract(o.world_T_tool, -shift))

@@ -80,9 +80,7 @@ def work(context: Context) -> Outcome:
         content = with_images(None, images.findings, images.scans, images.noise)
         write_json(run.diagnosis, content)
         told = [str(finding.statement) for finding in images.findings] or [str(content["statement"])]
-        result = {
-            "mismatch": content["mismatch"], "p_value": content["p_value"], "causes": _named(images.findings),
-        }  # fmt: skip
+        result = {"mismatch": content["mismatch"], "p_value": content["p_value"], "causes": _named(images.findings)}
         return Outcome({"diagnosis": result | {"heldout_px": content["heldout_px"]}}, [run.diagnosis], told)
     _, poses = require_robot(campaign)
     identification = load_identification(run)

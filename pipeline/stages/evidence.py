@@ -108,9 +108,7 @@ def evidence_of(
     second = first if not diagnosis.findings else _by_pose(errors[1], *_pose_rows(clean if verify is None else verify))
     both = [name for name in first if name in second]
     kind = "verify" if verify is not None else "cross-validation"
-    return Evidence(
-        causes, kind, tuple(both), np.array([first[n] for n in both]), np.array([second[n] for n in both])
-    )
+    return Evidence(causes, kind, tuple(both), np.array([first[n] for n in both]), np.array([second[n] for n in both]))
 
 
 def _pose_rows(recording: Recording) -> tuple[Array, tuple[str, ...]]:
@@ -174,10 +172,18 @@ def _cause(finding: Finding, looks: Sequence[Look], scale: float) -> CauseEviden
     variables = {name: np.concatenate(columns) for name, columns in values.items()}
     curves = _curves(group, variables) if group else {}
     return CauseEvidence(
-        family.cause, family.where, family.direction, f"{group[0][0].frame}.{group[0][0].kind}" if group else "share",
-        tuple(poses), np.array(kept, dtype=bool), np.concatenate(measured), np.concatenate(sigma),
-        np.concatenate(fitted), variables, curves,
-    )  # fmt: skip
+        family.cause,
+        family.where,
+        family.direction,
+        f"{group[0][0].frame}.{group[0][0].kind}" if group else "share",
+        tuple(poses),
+        np.array(kept, dtype=bool),
+        np.concatenate(measured),
+        np.concatenate(sigma),
+        np.concatenate(fitted),
+        variables,
+        curves,
+    )
 
 
 Group = list[tuple[Basis, float]]

@@ -121,10 +121,7 @@ def identify_recording(
 
 
 def variance_factors(
-    found: IdentifiedRobot,
-    inputs: PoseInputs,
-    used: Sequence[RobotObservations],
-    kinds: Sequence[RobotObservations],
+    found: IdentifiedRobot, inputs: PoseInputs, used: Sequence[RobotObservations], kinds: Sequence[RobotObservations]
 ) -> list[Array]:
     """Factor by which the variances of each kind are too small: (2,) position and rotation of frames, else (1,).
 

@@ -51,7 +51,11 @@ def check_joint_log(
 
 
 def check_failed_fit(
-    robot: RobotModel, poses: Poses, inputs: PoseInputs, recording: RobotRecording, kernel: Kernel,
+    robot: RobotModel,
+    poses: Poses,
+    inputs: PoseInputs,
+    recording: RobotRecording,
+    kernel: Kernel,
     found: IdentifiedRobot,
 ) -> None:
     """Where even the identified robot misses by many sigmas, look for smaller slips (a sign of the last joint, say).

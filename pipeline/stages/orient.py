@@ -127,9 +127,12 @@ def _detections(campaign: Campaign, run: Run, poses: Poses) -> dict[str, dict[in
 
 
 def _marks(
-    campaign: Campaign, detections: Mapping[str, Mapping[int, Detections]], body: Body, poses: Poses,
+    campaign: Campaign,
+    detections: Mapping[str, Mapping[int, Detections]],
+    body: Body,
+    poses: Poses,
     start: Mapping[str, Camera | None],
-) -> tuple[dict[str, StationMarks], tuple[tuple[str, int, str], ...]]:  # fmt: skip
+) -> tuple[dict[str, StationMarks], tuple[tuple[str, int, str], ...]]:
     place = {name: i for i, name in enumerate(poses.names)}
     given = {
         name: _from_table(source.marks, body, place)
@@ -193,9 +196,11 @@ def _write_cameras(campaign: Campaign, run: Run, orientation: StationOrientation
         sigma = np.sqrt(np.clip(np.diag(interior), 0, None))
         start = campaign.cameras[name].start
         content = CameraFile(
-            camera, placed[name], start.pixel_um if start else None,
+            camera,
+            placed[name],
+            start.pixel_um if start else None,
             dict(zip(INTRINSIC_NAMES, map(float, sigma), strict=True)),
-        )  # fmt: skip
+        )
         write_camera(run.camera(name), content, f"oriented in campaign {campaign.name}")
         paths.append(run.camera(name))
     return paths

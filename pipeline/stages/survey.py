@@ -216,9 +216,7 @@ def _write(run: Run, name: str, source: ImageSource, body: Body, done: SurveyRes
     pixel = source.start.pixel_um if source.start is not None else None
     run.colmap(name).mkdir(parents=True, exist_ok=True)
     export_colmap(done.network, run.colmap(name))
-    camera = CameraFile(
-        done.network.camera, None, pixel, dict(zip(INTRINSIC_NAMES, map(float, sigma), strict=True))
-    )
+    camera = CameraFile(done.network.camera, None, pixel, dict(zip(INTRINSIC_NAMES, map(float, sigma), strict=True)))
     path = run.camera(f"{NAME}_{name}")
     write_camera(path, camera, f"self-calibrated in the survey of {name}")
     return [run.body(name), path]

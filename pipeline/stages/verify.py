@@ -158,9 +158,7 @@ def _write_residuals(
 
 
 def _statistics(tools: Mapping[str, ErrorStatistics]) -> dict[str, dict[str, float]]:
-    return {
-        name: {key: value * 1000 for key, value in vars(errors).items()} for name, errors in tools.items()
-    }
+    return {name: {key: value * 1000 for key, value in vars(errors).items()} for name, errors in tools.items()}
 
 
 def _result(outcome: Verification) -> dict[str, Any]:

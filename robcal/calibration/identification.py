@@ -16,11 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robcal import transforms as tf
-from robcal.calibration.identifiability import (
-    check_poses,
-    choose_candidates,
-    observability_indices,
-)
+from robcal.calibration.identifiability import check_poses, choose_candidates, observability_indices
 from robcal.calibration.observations import FrameObservations, Observations, Stack, basis_points
 from robcal.calibration.outliers import PoseStatistics, find_outliers, pose_statistics
 from robcal.calibration.problem import CellEvaluator, Evaluator, Problem, State, whitening
@@ -213,10 +209,12 @@ def start_state(evaluator: Evaluator, observations: Sequence[Observations]) -> S
     pairs = candidates(cell.base_T_flange, observations)
     if kernel.model.world_T_base is not None and kernel.model.flange_T_tool is not None:
         given = kernel.theta0
-        pairs.append((
-            kernel.world_T_base @ tf.frame_from_xyzrpy(given[cell.base]),
-            kernel.flange_T_tool @ tf.frame_from_xyzrpy(given[cell.tool]),
-        ))
+        pairs.append(
+            (
+                kernel.world_T_base @ tf.frame_from_xyzrpy(given[cell.base]),
+                kernel.flange_T_tool @ tf.frame_from_xyzrpy(given[cell.tool]),
+            )
+        )
     if not pairs:
         raise NotIdentifiable(
             "no start values for base and tool can be constructed: measure at least 3 poses in 6D, 4 poses with one "
@@ -243,8 +241,14 @@ def start_state(evaluator: Evaluator, observations: Sequence[Observations]) -> S
 
 
 def _result(
-    engine: Engine, options: IdentifyOptions, solution: Solution, weights: Array, outliers: list[int],
-    poses: PoseStatistics, clock: float, seconds_kernel: float,
+    engine: Engine,
+    options: IdentifyOptions,
+    solution: Solution,
+    weights: Array,
+    outliers: list[int],
+    poses: PoseStatistics,
+    clock: float,
+    seconds_kernel: float,
 ) -> IdentifiedRobot:
     kernel, stack = engine.kernel, engine.stack
     r, J = solution.problem.linearise(solution.state)
@@ -269,15 +273,33 @@ def _result(
     calibrated.model, calibrated.theta0 = model, state.theta
     theta = state.theta[solution.problem.columns]
     return IdentifiedRobot(
-        model=model, kernel=calibrated, names=solution.names, theta=theta, covariance=statistics.cofactor * scale,
-        covariance_scale=scale, sigma0=sigma0, redundancy=redundancy, p_value=p_value, eliminated=solution.eliminated,
-        rejected_elasticities=solution.rejected, condition=statistics.condition,
-        condition_raw=statistics.condition_raw, correlations=statistics.correlations,
-        observability=observability_indices(statistics.singular_values), residuals=poses.residuals,
-        normalised=np.sqrt(poses.square), leverage=poses.leverage, redundancy_numbers=poses.redundancy,
-        outliers=tuple(outliers), used=weights > 0, options=options, first_summary=solution.first,
-        summary=solution.summary, iterations=solution.iterations,
-        seconds=time.perf_counter() - clock, seconds_kernel=seconds_kernel,
+        model=model,
+        kernel=calibrated,
+        names=solution.names,
+        theta=theta,
+        covariance=statistics.cofactor * scale,
+        covariance_scale=scale,
+        sigma0=sigma0,
+        redundancy=redundancy,
+        p_value=p_value,
+        eliminated=solution.eliminated,
+        rejected_elasticities=solution.rejected,
+        condition=statistics.condition,
+        condition_raw=statistics.condition_raw,
+        correlations=statistics.correlations,
+        observability=observability_indices(statistics.singular_values),
+        residuals=poses.residuals,
+        normalised=np.sqrt(poses.square),
+        leverage=poses.leverage,
+        redundancy_numbers=poses.redundancy,
+        outliers=tuple(outliers),
+        used=weights > 0,
+        options=options,
+        first_summary=solution.first,
+        summary=solution.summary,
+        iterations=solution.iterations,
+        seconds=time.perf_counter() - clock,
+        seconds_kernel=seconds_kernel,
     )
 
 

@@ -131,7 +131,9 @@ def restricted_components(blocks: Iterable[tuple[Array, Array, Array]]) -> Compo
     grid = np.linspace(middle - BELOW, middle + ABOVE, LOOKS)
     k = int(np.argmin([profile(float(x))[0] for x in grid]))
     found = optimize.minimize_scalar(
-        lambda x: profile(x)[0], bounds=(grid[max(0, k - 1)], grid[min(LOOKS - 1, k + 1)]), method="bounded",
+        lambda x: profile(x)[0],
+        bounds=(grid[max(0, k - 1)], grid[min(LOOKS - 1, k + 1)]),
+        method="bounded",
         options={"xatol": 1e-2},
-    )  # fmt: skip
+    )
     return Components(profile(float(found.x))[1], float(np.exp(found.x)), none[1], none[0] - float(found.fun))

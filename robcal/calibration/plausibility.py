@@ -54,9 +54,7 @@ class LikelyCause:
     rms_after: float
 
 
-def nominal_miss(
-    kernel: Kernel, poses: PoseInputs, observations: Sequence[Observations]
-) -> tuple[float, Array]:
+def nominal_miss(kernel: Kernel, poses: PoseInputs, observations: Sequence[Observations]) -> tuple[float, Array]:
     """RMS miss (m) of the model with the best base and tool, and that of each pose (n,).
 
     Raises
@@ -83,7 +81,10 @@ def outside_limits(model: RobotModel, poses: PoseInputs) -> list[tuple[int, str,
 
 
 def likely_causes(
-    model: RobotModel, poses: PoseInputs, observations: Sequence[Observations], kernel: Kernel | None = None,
+    model: RobotModel,
+    poses: PoseInputs,
+    observations: Sequence[Observations],
+    kernel: Kernel | None = None,
     share: float = SUSPICIOUS_SHARE,
 ) -> list[LikelyCause]:
     """Slips that explain why the nominal robot misses the measurements by far; best explanation first.
@@ -134,8 +135,11 @@ def _repairs(
         (np.pi / 180, "degrees stand where radians are expected"),
         (180 / np.pi, "radians stand where degrees are expected"),
     ):
-        yield "wrong_unit", "all joints", f"the joint angles have a wrong unit ({words})", with_q(
-            np.where(rotary, q * factor, q)
+        yield (
+            "wrong_unit",
+            "all joints",
+            f"the joint angles have a wrong unit ({words})",
+            with_q(np.where(rotary, q * factor, q)),
         )
     for k, name in enumerate(names):
         new = q.copy()
@@ -144,17 +148,29 @@ def _repairs(
     for i, k in combinations(range(len(names)), 2):
         new = q.copy()
         new[:, [i, k]] = q[:, [k, i]]
-        yield "exchanged_columns", f"{names[i]} and {names[k]}", f"the columns of joints {i + 1} and {k + 1} are " \
-            "exchanged", with_q(new)
+        yield (
+            "exchanged_columns",
+            f"{names[i]} and {names[k]}",
+            f"the columns of joints {i + 1} and {k + 1} are exchanged",
+            with_q(new),
+        )
     yield from _measurement_repairs(poses, observations)
     for shift in (1, -1, 2, -2):
-        yield "slipped_rows", "all rows", f"the joint log is slipped by {abs(shift)} row(s) against the measurements " \
-            f"({'late' if shift > 0 else 'early'})", _slip(poses, observations, 0, n, shift)
+        yield (
+            "slipped_rows",
+            "all rows",
+            f"the joint log is slipped by {abs(shift)} row(s) against the measurements "
+            f"({'late' if shift > 0 else 'early'})",
+            _slip(poses, observations, 0, n, shift),
+        )
     for start in _breaks(kernel, poses, observations):
         for shift in (1, -1):
-            yield "slipped_rows", f"from row {start + 1}", f"from row {start + 1} on the joint log is slipped by one " \
-                f"row against the measurements ({'late' if shift > 0 else 'early'})", _slip(
-                poses, observations, start, n, shift
+            yield (
+                "slipped_rows",
+                f"from row {start + 1}",
+                f"from row {start + 1} on the joint log is slipped by one "
+                f"row against the measurements ({'late' if shift > 0 else 'early'})",
+                _slip(poses, observations, start, n, shift),
             )
 
 

@@ -71,6 +71,7 @@ def choose_d_optimal(
     design: Design, count: int, *, progress: Progress | None = None, repeats: bool = False
 ) -> list[int]:
     """Greedy D-optimal choice: each next pose shrinks the parameters' volume most."""
+
     def score(covariance: Array) -> Array:
         return _volume_gain(design.rows, covariance)
 
@@ -81,6 +82,7 @@ def choose_worst_case(
     design: Design, count: int, *, progress: Progress | None = None, repeats: bool = False
 ) -> list[int]:
     """Greedy choice by the tool: each next pose reduces the sum of the worst tenth of predicted variances most."""
+
     def score(covariance: Array) -> Array:
         errors = predicted_errors(design, covariance)
         worst = np.argsort(errors)[-max(1, len(errors) // 10) :]

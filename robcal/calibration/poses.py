@@ -139,20 +139,34 @@ def generate_poses(request: PoseRequest) -> PosePlan:
     covariance = covariance_of(design, chosen)
     errors = predicted_errors(design, covariance)
     return PosePlan(
-        q=q, verify=np.isin(rows, checking), approach=approaches.direction, via=approaches.via,
-        seen=np.sum(candidates.seen[rows], axis=2), world_T_body=candidates.world_T_body[rows],
-        predicted=(float(np.mean(errors)), float(np.max(errors))), reached=reached, travel=path_length(q, ranges),
-        tried=candidates.tried, rejected=candidates.rejected,
-    )  # fmt: skip
+        q=q,
+        verify=np.isin(rows, checking),
+        approach=approaches.direction,
+        via=approaches.via,
+        seen=np.sum(candidates.seen[rows], axis=2),
+        world_T_body=candidates.world_T_body[rows],
+        predicted=(float(np.mean(errors)), float(np.max(errors))),
+        reached=reached,
+        travel=path_length(q, ranges),
+        tried=candidates.tried,
+        rejected=candidates.rejected,
+    )
 
 
 def design_of(request: PoseRequest, candidates: Candidates) -> Design:
     """Information of each candidate on the parameters, and where accuracy is wanted."""
     model, cell = request.model, request.cell
     nominal = RobotModel(
-        model.name, model.frames, model.gravity, model.gravity_frame, {}, (), model.payloads,
-        cell.world_T_base, cell.flange_T_body,
-    )  # fmt: skip
+        model.name,
+        model.frames,
+        model.gravity,
+        model.gravity_frame,
+        {},
+        (),
+        model.payloads,
+        cell.world_T_base,
+        cell.flange_T_body,
+    )
     kernel = Kernel(nominal)
     poses = kernel.poses(candidates.q, request.payload)
     names = _names(request)
@@ -193,7 +207,7 @@ def _information_root(request: PoseRequest, candidates: Candidates) -> Array:
     if cell.viewpoints and cell.body is not None:
         information = frame_information(
             candidates.world_T_body, cell.body, cell.viewpoints, candidates.seen, request.sigma_px
-        )  # fmt: skip
+        )
         # three targets in one line leave a turn open: the pseudo-inverse would call it exact, a weak prior does not
         covariance += np.linalg.inv(information + 1e-2 * np.eye(6))
     return np.swapaxes(np.linalg.cholesky(np.linalg.inv(covariance)), 1, 2)

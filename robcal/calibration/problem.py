@@ -111,8 +111,12 @@ class Problem:
     """
 
     def __init__(
-        self, evaluator: Evaluator, columns: ArrayLike, whitener: Array,
-        weights: Array | None = None, prior: Mapping[int, float] | None = None,
+        self,
+        evaluator: Evaluator,
+        columns: ArrayLike,
+        whitener: Array,
+        weights: Array | None = None,
+        prior: Mapping[int, float] | None = None,
     ) -> None:
         self.evaluator = evaluator
         self.kernel, self.poses, self.stack = evaluator.kernel, evaluator.poses, evaluator.stack

@@ -69,8 +69,12 @@ class Engine:
     """
 
     def __init__(
-        self, evaluator: Evaluator, choice: Candidates, joint_sigma: float | Sequence[float] | None = None,
-        priors: Mapping[str, float] | None = None, termination: TerminationSettings | None = None,
+        self,
+        evaluator: Evaluator,
+        choice: Candidates,
+        joint_sigma: float | Sequence[float] | None = None,
+        priors: Mapping[str, float] | None = None,
+        termination: TerminationSettings | None = None,
     ) -> None:
         self.evaluator, self.choice = evaluator, choice
         self.joint_sigma, self.termination = joint_sigma, termination or TerminationSettings()
@@ -101,7 +105,11 @@ class Engine:
         for round_ in range(4):
             problem = self.problem(state, kept, weights)
             state, summary = gauss_newton(
-                problem.linearise, problem.residuals, problem.retract, state, self.termination,
+                problem.linearise,
+                problem.residuals,
+                problem.retract,
+                state,
+                self.termination,
                 USUAL_STEP * self._plausible(state, kept),
             )
             iterations += summary.iterations
@@ -156,9 +164,7 @@ class Engine:
         N = at_zero.N[np.ix_(chosen_from, chosen_from)]
         picked = choose_by_evidence(N, at_zero.b[chosen_from], at_zero.square, rows, len(forced), n_own)
         taken = [names[optional[k]] for k in picked.taken]
-        rejected = {
-            names[k]: float(p) for k, p in zip(optional, picked.p_values, strict=True) if names[k] not in taken
-        }
+        rejected = {names[k]: float(p) for k, p in zip(optional, picked.p_values, strict=True) if names[k] not in taken}
         state = self._moved(solution.state, (*forced, *taken), (*own, *cross), names, at_zero)
         gone = {n: e for n, e in solution.eliminated.items() if n not in taken}
         if set(taken) == set(solution.names) - set(forced):
@@ -252,9 +258,7 @@ class Engine:
         if before is not None:
             # what enters late lies in a curved valley: only if the data say much more about it than was known
             limits = np.where([n in before for n in names], LATE_SHARE * limits, limits)
-        kept, gone = split_dependent(
-            self.normals(state, names, weights).N, names, limits, ties=before is not None
-        )
+        kept, gone = split_dependent(self.normals(state, names, weights).N, names, limits, ties=before is not None)
         if not kept:
             raise NotIdentifiable("the measurements do not depend on any parameter of the robot", names)
         stay = [names[k] for k in kept]

@@ -186,9 +186,7 @@ def _from_distances(T: Array, d: Array) -> list[Pair]:
     starts: list[tuple[Array, Array]] = []
     if n >= 17:
         b = d**2 - np.sum(t * t, axis=1)
-        A = np.concatenate(
-            [2 * np.einsum("nij,ni->nj", R, t), -2 * t, -2 * R.reshape(n, 9), np.ones((n, 1))], axis=1
-        )
+        A = np.concatenate([2 * np.einsum("nij,ni->nj", R, t), -2 * t, -2 * R.reshape(n, 9), np.ones((n, 1))], axis=1)
         solution = np.linalg.lstsq(A, b, rcond=1e-9)[0]
         starts.append((solution[:3], solution[3:6]))
     reach = float(np.median(d))

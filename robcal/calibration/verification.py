@@ -203,12 +203,18 @@ def cross_validate(
         there = poses.subset(out)
         T, C_T = predict_frames(robot, there)
         square, degrees = _normalised(robot, there, test, T, C_T)
-        parts.append((out, T, C_T, square, degrees, tool_errors(T, test),
-                      tool_errors(predict_frames(nominal, there)[0], test)))
+        parts.append(
+            (out, T, C_T, square, degrees, tool_errors(T, test), tool_errors(predict_frames(nominal, there)[0], test))
+        )
     rows = np.concatenate([p[0] for p in parts])
     merged = [
-        {name: (np.concatenate([p[0][p[at][name][0]] for p in parts]), np.concatenate([p[at][name][1] for p in parts]))
-         for name in parts[0][at]}
+        {
+            name: (
+                np.concatenate([p[0][p[at][name][0]] for p in parts]),
+                np.concatenate([p[at][name][1] for p in parts]),
+            )
+            for name in parts[0][at]
+        }
         for at in (5, 6)
     ]
     square, degrees, C_T = (np.concatenate([p[at] for p in parts]) for at in (3, 4, 2))
@@ -237,9 +243,16 @@ def _normalised(
 
 
 def _verification(
-    kind: str, poses: PoseInputs, errors: Mapping[str, tuple[NDArray[np.int64], Array]],
-    nominal: Mapping[str, tuple[NDArray[np.int64], Array]] | None, square: Array, degrees: NDArray[np.int64],
-    C_T: Array, T: Array, observations: Sequence[Observations], rows: NDArray[np.int64],
+    kind: str,
+    poses: PoseInputs,
+    errors: Mapping[str, tuple[NDArray[np.int64], Array]],
+    nominal: Mapping[str, tuple[NDArray[np.int64], Array]] | None,
+    square: Array,
+    degrees: NDArray[np.int64],
+    C_T: Array,
+    T: Array,
+    observations: Sequence[Observations],
+    rows: NDArray[np.int64],
 ) -> Verification:
     measured = degrees > 0
     total = float(np.sum(square * degrees))
@@ -279,6 +292,11 @@ def _pose_accuracy(poses: PoseInputs, T: Array, observations: Sequence[Observati
             distance = np.linalg.norm(mine[:, :3] - centre[:3], axis=1)
             rp.append(distance.mean() + 3.0 * distance.std(ddof=1))
     return PoseAccuracy(
-        float(np.mean(ap)), float(np.max(ap)), float(np.mean(ap_turn)), float(np.max(ap_turn)),
-        float(np.mean(rp)) if rp else float("nan"), float(np.max(rp)) if rp else float("nan"), len(ap),
+        float(np.mean(ap)),
+        float(np.max(ap)),
+        float(np.mean(ap_turn)),
+        float(np.max(ap_turn)),
+        float(np.mean(rp)) if rp else float("nan"),
+        float(np.max(rp)) if rp else float("nan"),
+        len(ap),
     )

@@ -82,12 +82,7 @@ def acts_once(family: Family) -> bool:
 
 
 def analyse(
-    fit: Fit,
-    recording: Recording,
-    tied: frozenset[str],
-    *,
-    runs: int = 400,
-    level: FamilyWise | None = None,
+    fit: Fit, recording: Recording, tied: frozenset[str], *, runs: int = 400, level: FamilyWise | None = None
 ) -> Analysis:
     """Scan all candidates at a fit; `level` reuses a simulated family-wise level of the same design."""
     at = tangents(fit, recording)

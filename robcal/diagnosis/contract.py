@@ -38,9 +38,9 @@ def as_contract(diagnosis: Diagnosis) -> dict[str, object]:
             "after": number(diagnosis.heldout[1] * 1e3),
             "noise_floor": number(diagnosis.heldout[2] * 1e3),
             "kind": diagnosis.heldout_kind,
-            "region": None if diagnosis.region is None else dict(
-                zip(("before", "after"), (number(v * 1e3) for v in diagnosis.region), strict=True)
-            ),
+            "region": None
+            if diagnosis.region is None
+            else dict(zip(("before", "after"), (number(v * 1e3) for v in diagnosis.region), strict=True)),
         },
         "noise": {
             "stated": 1.0,
@@ -105,10 +105,7 @@ def image_cause(finding: ImageFinding) -> dict[str, object]:
 
 
 def with_images(
-    robot: dict[str, object] | None,
-    findings: Sequence[ImageFinding],
-    scans: Sequence[ImageDiagnosis],
-    noise: float,
+    robot: dict[str, object] | None, findings: Sequence[ImageFinding], scans: Sequence[ImageDiagnosis], noise: float
 ) -> dict[str, object]:
     """The content of diagnosis.json for images alone, or the robot's extended by what the images say first.
 

@@ -120,12 +120,14 @@ def find_curves(present: Fit, recording: Recording) -> Curves:
     matters = [folded.kept_out([j for j in everyone if j != k]) - after > LEAST_GAIN * before for k in everyone]
     values = _solve(present, columns)
     irregular = [
-        k for k in everyone
+        k
+        for k in everyone
         if matters[k]
         and _irregularity(
             families[k], values[k] * families[k].sizes(families[k].grid[0]), site.variables[f"q{joints[k].number}"]
-        ) > IRREGULAR
-    ]  # fmt: skip
+        )
+        > IRREGULAR
+    ]
     # where it is the make of the joints, all have it, also those whose few angles do not show how irregular it is
     keep = irregular if len(irregular) < SEVERAL else list(everyone)
     if not keep or folded.kept_out(keep) > GAIN * before:
@@ -198,9 +200,7 @@ def nested_errors(
         Y[:, :p] /= np.where((size := np.linalg.norm(present.jacobian, axis=0)) > 0, size, 1.0)
         Y[:, p:] *= sizes
         everything = np.ones(len(r), dtype=bool)
-        return tuple(
-            error(verify, there.residual - Y[:, :end] @ solved(everything, end), there.frames) for end in ends
-        )
+        return tuple(error(verify, there.residual - Y[:, :end] @ solved(everything, end), there.frames) for end in ends)
     label = folds(recording)[present.row_pose]
     out = []
     for end in ends:
@@ -356,8 +356,12 @@ def likenesses(accepted: Sequence[Accepted], angles: Sequence[Array]) -> tuple[L
                     r = float(a @ b) / max(float(np.sqrt((a @ a) * (b @ b))), 1e-300)
                     if r > ALIKE and (best is None or r > best.correlation):
                         best = Likeness(
-                            accepted[j].family.where, accepted[i].family.where, sense,
-                            shift * 2.0 * np.pi / steps, r, overlap,
+                            accepted[j].family.where,
+                            accepted[i].family.where,
+                            sense,
+                            shift * 2.0 * np.pi / steps,
+                            r,
+                            overlap,
                         )
         if best is not None:
             found.append(best)

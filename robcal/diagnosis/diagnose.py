@@ -19,12 +19,7 @@ from robcal.diagnosis.recording import Recording, observation_data
 from robcal.diagnosis.region import region_errors
 from robcal.diagnosis.result import Diagnosis, Finding, Rival
 from robcal.diagnosis.scan import orthonormal_basis
-from robcal.diagnosis.selection import (
-    Selection,
-    SelectionSettings,
-    poses_that_carry,
-    select,
-)
+from robcal.diagnosis.selection import Selection, SelectionSettings, poses_that_carry, select
 from robcal.diagnosis.swaps import find_swaps, relabelled
 from robcal.diagnosis.unloaded import unloaded_elasticities
 from robcal.physics.family import Array, ObservationData, numeric_sigma
@@ -167,18 +162,32 @@ def _curves(
         for like in curves.likenesses:
             if like.joint == family.where:
                 told["like"] = {
-                    "axis": like.other, "sense": like.sense, "turned_deg": float(np.degrees(like.shift)),
-                    "correlation": like.correlation, "overlap_deg": float(np.degrees(like.overlap)),
-                }  # fmt: skip
+                    "axis": like.other,
+                    "sense": like.sense,
+                    "turned_deg": float(np.degrees(like.shift)),
+                    "correlation": like.correlation,
+                    "overlap_deg": float(np.degrees(like.overlap)),
+                }
                 statement += f"; it is the curve of {like.other}{' reversed and' if like.sense < 0 else ''} turned by "
                 statement += f"{np.degrees(like.shift):.0f} deg (correlation {like.correlation:.2f})"
         none = np.zeros((len(item.values), len(item.values)))
         findings.append(
             Finding(
-                family, item.constants, item.values, none, told, {}, curves.p_value, 0.0, (), curves.shares[k], (),
-                (errors[k], errors[k + 1]), statement,
+                family,
+                item.constants,
+                item.values,
+                none,
+                told,
+                {},
+                curves.p_value,
+                0.0,
+                (),
+                curves.shares[k],
+                (),
+                (errors[k], errors[k + 1]),
+                statement,
             )
-        )  # fmt: skip
+        )
     return curves, tuple(findings)
 
 

@@ -178,14 +178,20 @@ def _findings(item: _Accepted) -> Iterator[ImageFinding]:
     for where in cause.told_of:
         text = _sentence(cause, told, where)
         yield ImageFinding(
-            cause.cause, cause.stage, where, cause.direction, told, sigma, item.p_value, item.rivals, item.heldout_px,
+            cause.cause,
+            cause.stage,
+            where,
+            cause.direction,
+            told,
+            sigma,
+            item.p_value,
+            item.rivals,
+            item.heldout_px,
             text,
-        )  # fmt: skip
+        )
 
 
-def _adequate(
-    fields: Mapping[str, Array], cause: ImageCause, basis: Array, residual: Array, freedom: int
-) -> bool:
+def _adequate(fields: Mapping[str, Array], cause: ImageCause, basis: Array, residual: Array, freedom: int) -> bool:
     """Whether a smooth field over the camera's image finds nothing beside a cause that bends images itself.
 
     What a lens model leaves over looks partly like refraction; the name holds only if it explains (nearly) all of it.

@@ -58,10 +58,18 @@ def exchanged_targets(
         text = f"Targets {first} and {second} are swapped: each is seen where the file has the other"
         found.append(
             ImageFinding(
-                "target_swapped", "body", str(first), None, {"with": int(second)}, {}, p_value, (),
-                (before, orientation.rms_px), text,
+                "target_swapped",
+                "body",
+                str(first),
+                None,
+                {"with": int(second)},
+                {},
+                p_value,
+                (),
+                (before, orientation.rms_px),
+                text,
             )
-        )  # fmt: skip
+        )
     return tuple(found)
 
 

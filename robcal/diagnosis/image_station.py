@@ -41,9 +41,7 @@ class StationOperator:
     columns : (m, 18) global columns of each mark. extra : (k, g) whitened rows of the weighted observations.
     """
 
-    def __init__(
-        self, design: StationDesign, pose: Array, columns: Array, extra: sparse.csr_matrix
-    ) -> None:
+    def __init__(self, design: StationDesign, pose: Array, columns: Array, extra: sparse.csr_matrix) -> None:
         m, g, p = len(pose), len(design.active), len(design.pose_inverse)
         blocks = np.concatenate([design.by_exterior, design.by_interior, design.by_point], axis=2)
         marks = sparse.csr_matrix(

@@ -234,9 +234,7 @@ def _beside(family: Family, after: Analysis, level: float) -> float:
     return max(others - SECOND, 0.0)
 
 
-def choose(
-    look: Analysis, open_to: Array | None = None, level: float = DEFAULTS.level
-) -> tuple[int, Constants] | None:
+def choose(look: Analysis, open_to: Array | None = None, level: float = DEFAULTS.level) -> tuple[int, Constants] | None:
     """The family to be added: best name or, where that explains less, the best empirical term.
 
     Only families that a test finds by themselves: evidence alone would take whatever costs little and explains nothing

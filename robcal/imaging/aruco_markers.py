@@ -51,9 +51,11 @@ def diagonal_intersection(corners: Array) -> tuple[Array, Array]:
     normal_first = np.stack([-first[:, 1], first[:, 0]], axis=-1) / determinant[:, None]
     normal_second = np.stack([-second[:, 1], second[:, 0]], axis=-1) / determinant[:, None]
     for corner, weight, along, normal in (
-        (0, 1 - t, second, normal_first), (2, t, second, normal_first),
-        (1, -(1 - u), first, normal_second), (3, -u, first, normal_second),
-    ):  # fmt: skip
+        (0, 1 - t, second, normal_first),
+        (2, t, second, normal_first),
+        (1, -(1 - u), first, normal_second),
+        (3, -u, first, normal_second),
+    ):
         derivative[:, :, corner, :] = weight[:, None, None] * along[:, :, None] * normal[:, None, :]
     return centre, derivative
 

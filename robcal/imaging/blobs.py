@@ -41,15 +41,27 @@ class Candidates:
     def take(self, chosen: NDArray) -> Candidates:
         """The chosen rows."""
         return Candidates(
-            self.xy[chosen], self.semi_axes[chosen], self.angle[chosen], self.base[chosen], self.peak[chosen],
-            self.blur[chosen], self.nodes_exhausted,
-        )  # fmt: skip
+            self.xy[chosen],
+            self.semi_axes[chosen],
+            self.angle[chosen],
+            self.base[chosen],
+            self.peak[chosen],
+            self.blur[chosen],
+            self.nodes_exhausted,
+        )
 
 
 def judge(
-    mask: NDArray[np.uint8], crop: NDArray, area: int, level: float, base: float, corner: tuple[int, int],
-    shape: tuple[int, ...], settings: DetectionSettings, found: list[tuple[float, ...]],
-) -> Reason | None:  # fmt: skip
+    mask: NDArray[np.uint8],
+    crop: NDArray,
+    area: int,
+    level: float,
+    base: float,
+    corner: tuple[int, int],
+    shape: tuple[int, ...],
+    settings: DetectionSettings,
+    found: list[tuple[float, ...]],
+) -> Reason | None:
     """None and an entry in `found` if the blob may be a dot, else why not."""
     height, width = mask.shape
     x, y = corner

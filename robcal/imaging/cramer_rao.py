@@ -18,9 +18,16 @@ Array = NDArray[np.float64]
 
 
 def centre_bound(
-    semi_axes: tuple[float, float], angle: float, blur: float, contrast: float, background: float, noise: NoiseModel,
-    *, phase: tuple[float, float] = (0.0, 0.0), known_shape: bool = False,
-) -> Array:  # fmt: skip
+    semi_axes: tuple[float, float],
+    angle: float,
+    blur: float,
+    contrast: float,
+    background: float,
+    noise: NoiseModel,
+    *,
+    phase: tuple[float, float] = (0.0, 0.0),
+    known_shape: bool = False,
+) -> Array:
     """(2, 2) bound of the centre of an evenly bright ellipse on an even background.
 
     Parameters

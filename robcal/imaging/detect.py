@@ -176,9 +176,14 @@ def _readings(
 
 
 def _merged(
-    image: NDArray, dots: FittedDots, readings: RingReadings, more: FittedDots, noise: NoiseModel, saturation: float,
+    image: NDArray,
+    dots: FittedDots,
+    readings: RingReadings,
+    more: FittedDots,
+    noise: NoiseModel,
+    saturation: float,
     settings: DetectionSettings,
-) -> tuple[FittedDots, RingReadings]:  # fmt: skip
+) -> tuple[FittedDots, RingReadings]:
     new = _readings(image, more, noise, saturation, settings)
     # what waited because it may be part of a ring carries no code of its own
     new = replace(new, code=np.full(len(more), -1, np.int64))
@@ -197,14 +202,21 @@ def _columns(dots: FittedDots, readings: RingReadings, settings: DetectionSettin
         readings.code >= 0, CodeState.READ, np.where(readings.evidence, CodeState.UNREADABLE, CodeState.NONE)
     )
     return {
-        "xy": dots.xy, "covariance": dots.covariance, "semi_axes": dots.semi_axes, "angle": dots.angle,
+        "xy": dots.xy,
+        "covariance": dots.covariance,
+        "semi_axes": dots.semi_axes,
+        "angle": dots.angle,
         "contrast": -dots.contrast if dark else dots.contrast,
-        "background": top - dots.background if dark else dots.background, "saturated": dots.saturated,
+        "background": top - dots.background if dark else dots.background,
+        "saturated": dots.saturated,
         "code": readings.code.astype(np.int64),
         "kind": np.where(readings.code >= 0, int(TargetKind.RING12), int(TargetKind.DOT)).astype(np.int8),
-        "code_state": np.asarray(state, dtype=np.int8), "blur": blur_without_pixel(dots.s), "residual": dots.residual,
-        "chi2": dots.chi2, "gain_gradient": dots.gain_gradient,
-    }  # fmt: skip
+        "code_state": np.asarray(state, dtype=np.int8),
+        "blur": blur_without_pixel(dots.s),
+        "residual": dots.residual,
+        "chi2": dots.chi2,
+        "gain_gradient": dots.gain_gradient,
+    }
 
 
 def _detections(

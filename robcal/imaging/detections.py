@@ -116,19 +116,41 @@ class Detections:
 
 
 _COLUMNS = (
-    "xy", "covariance", "semi_axes", "angle", "contrast", "background", "saturated", "code", "kind", "code_state",
-    "blur", "residual", "chi2", "gain_gradient",
-)  # fmt: skip
+    "xy",
+    "covariance",
+    "semi_axes",
+    "angle",
+    "contrast",
+    "background",
+    "saturated",
+    "code",
+    "kind",
+    "code_state",
+    "blur",
+    "residual",
+    "chi2",
+    "gain_gradient",
+)
 
 
 def empty_columns(n: int = 0) -> dict[str, NDArray]:
     """Columns of n targets, all zero, code -1."""
     return {
-        "xy": np.zeros((n, 2)), "covariance": np.zeros((n, 2, 2)), "semi_axes": np.zeros((n, 2)),
-        "angle": np.zeros(n), "contrast": np.zeros(n), "background": np.zeros(n), "saturated": np.zeros(n, bool),
-        "code": np.full(n, -1, np.int64), "kind": np.zeros(n, np.int8), "code_state": np.zeros(n, np.int8),
-        "blur": np.zeros(n), "residual": np.zeros(n), "chi2": np.ones(n), "gain_gradient": np.zeros((n, 2)),
-    }  # fmt: skip
+        "xy": np.zeros((n, 2)),
+        "covariance": np.zeros((n, 2, 2)),
+        "semi_axes": np.zeros((n, 2)),
+        "angle": np.zeros(n),
+        "contrast": np.zeros(n),
+        "background": np.zeros(n),
+        "saturated": np.zeros(n, bool),
+        "code": np.full(n, -1, np.int64),
+        "kind": np.zeros(n, np.int8),
+        "code_state": np.zeros(n, np.int8),
+        "blur": np.zeros(n),
+        "residual": np.zeros(n),
+        "chi2": np.ones(n),
+        "gain_gradient": np.zeros((n, 2)),
+    }
 
 
 class RejectionLog:

@@ -124,9 +124,15 @@ def refit_ringed(
         # foreign light in the window that the code does not explain
         background, contrast, s, major, cx, cy = (
             column.astype(np.float32)[:, None]
-            for column in (dots.background[source], dots.contrast[source], dots.s[source], dots.semi_axes[source, 0],
-                           local[:, 0], local[:, 1])
-        )  # fmt: skip
+            for column in (
+                dots.background[source],
+                dots.contrast[source],
+                dots.s[source],
+                dots.semi_axes[source, 0],
+                local[:, 0],
+                local[:, 1],
+            )
+        )
         clean = replace(window, value=window.value - glare * contrast, valid=window.valid & (glare < _GLARE_MAX))
         far = (window.x - cx) ** 2 + (window.y - cy) ** 2 > (major + 2.0 * s + 0.7) ** 2
         clean = replace(clean, valid=clean.valid & ~(far & (clean.value > background + 0.2 * contrast)))
@@ -223,13 +229,23 @@ def _columns(fit: EllipseFits, window: Windows, noise: NoiseModel) -> dict:
     s = np.exp(parameters[:, 5])
     semi_axes, angle = axes_from_matrix(parameters[:, 2:5])
     return {
-        "xy": parameters[:, :2] + window.origin, "covariance": covariance, "b": parameters[:, 2:5],
-        "semi_axes": semi_axes, "angle": angle, "s": s, "background": parameters[:, 6], "contrast": contrast,
-        "gain_gradient": parameters[:, 10:12] / (safe * window.radius)[:, None], "chi2": chi2,
-        "misfit": np.sqrt(np.maximum(mean_square - expected, 0.0)) / safe, "residual": np.sqrt(mean_square) / safe,
-        "saturated": (window.saturated & window.valid).any(axis=1), "converged": fit.converged & (used > _PIXELS_MIN),
-        "is_spot": fit.is_spot, "shading_sigma": fit.shading_sigma,
-    }  # fmt: skip
+        "xy": parameters[:, :2] + window.origin,
+        "covariance": covariance,
+        "b": parameters[:, 2:5],
+        "semi_axes": semi_axes,
+        "angle": angle,
+        "s": s,
+        "background": parameters[:, 6],
+        "contrast": contrast,
+        "gain_gradient": parameters[:, 10:12] / (safe * window.radius)[:, None],
+        "chi2": chi2,
+        "misfit": np.sqrt(np.maximum(mean_square - expected, 0.0)) / safe,
+        "residual": np.sqrt(mean_square) / safe,
+        "saturated": (window.saturated & window.valid).any(axis=1),
+        "converged": fit.converged & (used > _PIXELS_MIN),
+        "is_spot": fit.is_spot,
+        "shading_sigma": fit.shading_sigma,
+    }
 
 
 def _join(results: list[dict], groups: list[Windows]) -> FittedDots:
@@ -237,10 +253,23 @@ def _join(results: list[dict], groups: list[Windows]) -> FittedDots:
     if not results:
         real, flag = np.zeros(0), np.zeros(0, bool)
         return FittedDots(
-            xy=np.zeros((0, 2)), covariance=np.zeros((0, 2, 2)), b=np.zeros((0, 3)), semi_axes=np.zeros((0, 2)),
-            angle=real, s=real, background=real, contrast=real, gain_gradient=np.zeros((0, 2)), chi2=real, misfit=real,
-            residual=real, saturated=flag, converged=flag, is_spot=flag, shading_sigma=real,
-        )  # fmt: skip
+            xy=np.zeros((0, 2)),
+            covariance=np.zeros((0, 2, 2)),
+            b=np.zeros((0, 3)),
+            semi_axes=np.zeros((0, 2)),
+            angle=real,
+            s=real,
+            background=real,
+            contrast=real,
+            gain_gradient=np.zeros((0, 2)),
+            chi2=real,
+            misfit=real,
+            residual=real,
+            saturated=flag,
+            converged=flag,
+            is_spot=flag,
+            shading_sigma=real,
+        )
     order = np.argsort(np.concatenate([window.index for window in groups]))
     columns = {name: np.concatenate([result[name] for result in results])[order] for name in results[0]}
     spots = columns["is_spot"]

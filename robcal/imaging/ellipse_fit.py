@@ -124,9 +124,15 @@ def start(shape: Array, base: Array, peak: Array, windows: Windows, is_spot: NDA
     parameters[:, 6], parameters[:, 9] = base, peak - base
     zeros = np.zeros_like(windows.x)
     return EllipseFits(
-        parameters, np.zeros((n, PARAMETERS, PARAMETERS)), np.full(n, np.inf), np.zeros(n, bool), is_spot, zeros, zeros,
+        parameters,
+        np.zeros((n, PARAMETERS, PARAMETERS)),
+        np.full(n, np.inf),
+        np.zeros(n, bool),
+        is_spot,
+        zeros,
+        zeros,
         np.zeros(n),
-    )  # fmt: skip
+    )
 
 
 @dataclass(frozen=True)
@@ -143,9 +149,14 @@ class _System:
 
 
 def _system(
-    parameters: Array, prior_blur: Array, windows: Windows, is_spot: NDArray[np.bool_], shading_sigma: Array,
-    precision: Array, buffers: tuple[Array, Array],
-) -> _System:  # fmt: skip
+    parameters: Array,
+    prior_blur: Array,
+    windows: Windows,
+    is_spot: NDArray[np.bool_],
+    shading_sigma: Array,
+    precision: Array,
+    buffers: tuple[Array, Array],
+) -> _System:
     """Normal equations with priors at the given parameters.
 
     `precision` (n, p) of the pixels, 0 if left out; `buffers` two arrays (>= n, 13, p) for the derivatives.
@@ -183,9 +194,14 @@ def _weight(precision: Array, windows: Windows, residual: Array) -> Array:
 
 
 def iterate(
-    fits: EllipseFits, windows: Windows, noise: NoiseModel, steps: int, tolerance: float = 0.02,
-    dropped: NDArray[np.bool_] | None = None, prior_blur: Array | None = None,
-) -> EllipseFits:  # fmt: skip
+    fits: EllipseFits,
+    windows: Windows,
+    noise: NoiseModel,
+    steps: int,
+    tolerance: float = 0.02,
+    dropped: NDArray[np.bool_] | None = None,
+    prior_blur: Array | None = None,
+) -> EllipseFits:
     """Levenberg-Marquardt steps on all fits that have not converged.
 
     Parameters
@@ -212,8 +228,11 @@ def iterate(
     sub, sub_precision = windows, precision
     for _ in range(steps):
         now = parameters[active]
-        step = _limited(_solve(best.normal[active], best.right[active], damping[active], is_spot[active]), now,
-                        windows.radius[active])  # fmt: skip
+        step = _limited(
+            _solve(best.normal[active], best.right[active], damping[active], is_spot[active]),
+            now,
+            windows.radius[active],
+        )
         trial = now + step
         trial[:, 5] = np.clip(trial[:, 5], np.log(0.28), np.log(np.maximum(windows.radius[active], 1.0) * 2.0))
         definite = (trial[:, 2] * trial[:, 4] > trial[:, 3] ** 2) & (trial[:, 2] > 0) & np.isfinite(trial).all(axis=1)
@@ -238,9 +257,14 @@ def iterate(
                 break
             sub, sub_precision = sub.take(left), sub_precision[left]
     return replace(
-        fits, parameters=parameters, normal=best.normal, cost=best.cost, converged=converged,
-        weight=_weight(precision, windows, best.residual), residual=best.residual,
-    )  # fmt: skip
+        fits,
+        parameters=parameters,
+        normal=best.normal,
+        cost=best.cost,
+        converged=converged,
+        weight=_weight(precision, windows, best.residual),
+        residual=best.residual,
+    )
 
 
 def _limited(step: Array, parameters: Array, radius: Array) -> Array:

@@ -112,10 +112,12 @@ def estimate_noise(image: NDArray) -> NoiseModel:
     bin_level = np.array([level[chosen].mean() for chosen in flat])
     bin_variance = np.array([_trimmed_mean(variance[chosen]) for chosen in flat])
     # a class in which even the flattest tiles have structure tells nothing
-    even = np.array([
-        np.median(structure[chosen]) < 4.0 * _CHI2_THIRD * max(float(np.median(variance[chosen])), floor)
-        for chosen in flat
-    ])  # fmt: skip
+    even = np.array(
+        [
+            np.median(structure[chosen]) < 4.0 * _CHI2_THIRD * max(float(np.median(variance[chosen])), floor)
+            for chosen in flat
+        ]
+    )
     if even.any():
         bin_level, bin_variance = bin_level[even], bin_variance[even]
     dark = float(np.median(level))
@@ -157,8 +159,9 @@ def with_gain(noise: NoiseModel, grey: Array, variance: Array, weight: Array) ->
     cumulated = np.cumsum((count * np.abs(grey_lift))[order])
     middle = float(gain[order][np.searchsorted(cumulated, 0.5 * cumulated[-1])])
     positive = middle if noise.gain >= 0 else min(middle, 0.0)
-    return NoiseModel(noise.variance, max(positive, 0.0) if noise.gain >= 0 else positive, noise.level,
-                      noise.correlation, noise.step)  # fmt: skip
+    return NoiseModel(
+        noise.variance, max(positive, 0.0) if noise.gain >= 0 else positive, noise.level, noise.correlation, noise.step
+    )
 
 
 def _pooled(lift: Array, variance: Array, weight: Array) -> tuple[Array, Array, Array]:

@@ -114,9 +114,16 @@ def _wrap(angle: Array) -> Array:
 
 
 def read_rings(
-    image: NDArray, xy: Array, b: Array, blur: Array, background: Array, contrast: Array, noise_sigma: Array,
-    saturation: float, known_codes: frozenset[int] | None = None,
-) -> RingReadings:  # fmt: skip
+    image: NDArray,
+    xy: Array,
+    b: Array,
+    blur: Array,
+    background: Array,
+    contrast: Array,
+    noise_sigma: Array,
+    saturation: float,
+    known_codes: frozenset[int] | None = None,
+) -> RingReadings:
     """Reads the codes around n fitted dots.
 
     Parameters
@@ -264,9 +271,7 @@ def ring_glare(xy: Array, b: Array, s: Array, reading: RingReadings, row: Array,
         middle = reading.phase[row] + (k + 0.5) * _SEGMENT_ANGLE
         around += reading.bits[row, k, None] * _window(_wrap(_PHI[None] - middle[:, None]), angular)
     around = (reading.level[row][:, None] * around).astype(x.dtype)
-    cx, cy, b11, b12, b22, blur = (
-        column.astype(x.dtype)[:, None] for column in (*xy.T, *b.T, s)
-    )  # fmt: skip
+    cx, cy, b11, b12, b22, blur = (column.astype(x.dtype)[:, None] for column in (*xy.T, *b.T, s))
     dx, dy = x - cx, y - cy
     u, v = b11 * dx + b12 * dy, b12 * dx + b22 * dy
     rho = np.maximum(np.sqrt(u * u + v * v), 1e-6)

@@ -201,8 +201,9 @@ def _boxes(
     outer = np.flatnonzero(hierarchy[0][:, 3] < 0)
     rows = [
         (*cv2.boundingRect(contour), *contour[0, 0].tolist())
-        for contour in (contours[index] for index in outer.tolist()) if len(contour) > 2
-    ]  # fmt: skip
+        for contour in (contours[index] for index in outer.tolist())
+        if len(contour) > 2
+    ]
     boxes = np.array(rows, dtype=np.int64).reshape(-1, 6)
     size = boxes[:, 2] * boxes[:, 3]
     large = (size >= 4) & (boxes[:, 2:4].min(axis=1) >= settings.min_axis_px)
@@ -242,9 +243,7 @@ def _stand_out(
     return high
 
 
-def _first_nodes(
-    above: NDArray, background: NDArray, offset: float, boxes: NDArray[np.int64]
-) -> list[_Node]:
+def _first_nodes(above: NDArray, background: NDArray, offset: float, boxes: NDArray[np.int64]) -> list[_Node]:
     """Connected parts above the background from their boxes, small ones last in the list."""
     nodes: list[_Node] = []
     for x, y, width, height, px, py in boxes.tolist():
@@ -258,9 +257,14 @@ def _first_nodes(
 
 
 def _split(
-    node: _Node, image: NDArray, noise: NoiseModel, settings: DetectionSettings,
-    nodes: list[_Node], found: list[tuple[float, ...]], log: RejectionLog,
-) -> None:  # fmt: skip
+    node: _Node,
+    image: NDArray,
+    noise: NoiseModel,
+    settings: DetectionSettings,
+    nodes: list[_Node],
+    found: list[tuple[float, ...]],
+    log: RejectionLog,
+) -> None:
     """Cuts one node half way between its base and its peak; dots go to `found`, the rest is cut again or refused."""
     height, width = node.mask.shape
     crop = image[node.y : node.y + height, node.x : node.x + width]

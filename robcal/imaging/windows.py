@@ -112,9 +112,15 @@ def _groups(half: NDArray[np.int64]) -> list[NDArray[np.int64]]:
 
 
 def _gather(
-    image: NDArray, candidates: Candidates, shape: Array, margin: Array, chosen: NDArray[np.int64], half: int,
-    saturation: float, neighbours: bool,
-) -> Windows:  # fmt: skip
+    image: NDArray,
+    candidates: Candidates,
+    shape: Array,
+    margin: Array,
+    chosen: NDArray[np.int64],
+    half: int,
+    saturation: float,
+    neighbours: bool,
+) -> Windows:
     height, width = image.shape
     offset = np.arange(-half, half + 1)
     centre = np.rint(candidates.xy[chosen]).astype(int)

@@ -275,12 +275,7 @@ def _drop_duplicates(work: _Work) -> None:
 
 
 def _clean(
-    work: _Work,
-    basis: Array,
-    free: Sequence[str],
-    ids: IntArray,
-    datum: DatumWish,
-    settings: AdjustSettings,
+    work: _Work, basis: Array, free: Sequence[str], ids: IntArray, datum: DatumWish, settings: AdjustSettings
 ) -> tuple[str, ...]:
     """Adjust without scale bars, first robustly, and take out gross errors until none is left.
 
@@ -305,8 +300,12 @@ def _clean(
         lin = linearise(state, problem.order, basis, problem.shift(state))
         if settings.variance_components:
             # robust until the gross errors are gone, then by redundancies
-            scale = np.array([robust_scale(lin.r[problem.group == g]) if np.any(problem.group == g) else 1.0
-                              for g in range(len(work.group_sigma))])  # fmt: skip
+            scale = np.array(
+                [
+                    robust_scale(lin.r[problem.group == g]) if np.any(problem.group == g) else 1.0
+                    for g in range(len(work.group_sigma))
+                ]
+            )
             scale = np.maximum(scale, 1e-9)
             if robust is not None:
                 work.group_sigma = scale

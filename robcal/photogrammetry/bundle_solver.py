@@ -132,12 +132,7 @@ def _cost(r: Array, weights: Array, bars: LinearisedLengths, limit: float | None
 
 
 def minimise(
-    problem: Problem,
-    state: State,
-    *,
-    robust: float | None = None,
-    max_iterations: int = 50,
-    tolerance: float = 1e-9,
+    problem: Problem, state: State, *, robust: float | None = None, max_iterations: int = 50, tolerance: float = 1e-9
 ) -> tuple[State, SolveSummary]:
     """Gauss-Newton steps until a step promises less than ``tolerance`` of the cost; damped where the cost would rise.
 
@@ -205,13 +200,6 @@ def minimise(
             converged, words = True, "converged"
             break
     summary = SolveSummary(
-        converged,
-        steps,
-        words,
-        history[0],
-        history[-1],
-        tuple(history),
-        halvings,
-        time.perf_counter() - begin,
+        converged, steps, words, history[0], history[-1], tuple(history), halvings, time.perf_counter() - begin
     )
     return state, summary

@@ -42,7 +42,14 @@ def has_rows(points: Array) -> bool:
 
 
 def search_grid(
-    camera: Camera, xy: Array, size: Array, contrast: Array, body: Body, candidates: IntArray, *, model_error_px: float,
+    camera: Camera,
+    xy: Array,
+    size: Array,
+    contrast: Array,
+    body: Body,
+    candidates: IntArray,
+    *,
+    model_error_px: float,
     others: Sequence[View] = (),
 ) -> tuple[list[Grown], str]:
     """Numberings (targets are rows of ``candidates``) that cannot be told apart, the best first; else a reason.
@@ -117,7 +124,13 @@ def _believed(found: Grown, n: int, value: float) -> tuple[bool, str]:
 
 
 def _with_rivals(
-    camera: Camera, xy: Array, size: Array, contrast: Array, points: Array, best: Grown, tolerance: float,
+    camera: Camera,
+    xy: Array,
+    size: Array,
+    contrast: Array,
+    points: Array,
+    best: Grown,
+    tolerance: float,
     others: Sequence[View],
 ) -> list[Grown]:
     """The best numbering, after trying all that the body's shape allows, and those it does not clearly beat."""

@@ -45,7 +45,13 @@ class Grown:
 
 
 def grow(
-    camera: Camera, camera_T_body: Array, points: Array, xy: Array, *, reach: float, tree: cKDTree | None = None,
+    camera: Camera,
+    camera_T_body: Array,
+    points: Array,
+    xy: Array,
+    *,
+    reach: float,
+    tree: cKDTree | None = None,
     lens: Camera | None = None,
 ) -> Grown | None:
     """Match and refine until the matches stay, the gate following the residuals from ``reach`` (px) downwards.
@@ -115,9 +121,13 @@ def refine_with_lens(
         factor = float(np.exp(np.clip(step[6], -0.2, 0.2)))
         trial_pose = retract(pose, step[:6])
         trial = replace(
-            camera, fx=camera.fx * factor, fy=camera.fy * factor, k1=camera.k1 + float(step[7]),
-            p1=camera.p1 + float(step[8]), p2=camera.p2 + float(step[9]),
-        )  # fmt: skip
+            camera,
+            fx=camera.fx * factor,
+            fy=camera.fy * factor,
+            k1=camera.k1 + float(step[7]),
+            p1=camera.p1 + float(step[8]),
+            p2=camera.p2 + float(step[9]),
+        )
         trial_value = cost(trial_pose, trial)
         if trial_value <= value:
             gain = value - trial_value
@@ -177,9 +187,7 @@ def _direction(camera_T_body: Array, points: Array) -> Array:
     return np.asarray(towards / np.linalg.norm(towards))
 
 
-def log_odds(
-    found: Grown, points: Array, *, sigma: float, density: float, others: Sequence[View] = ()
-) -> float:
+def log_odds(found: Grown, points: Array, *, sigma: float, density: float, others: Sequence[View] = ()) -> float:
     """Log odds of a numbering against chance: each matched dot against dots at random, each missing one against it.
 
     Parameters

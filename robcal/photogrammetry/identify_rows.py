@@ -155,8 +155,10 @@ def row_hypotheses(
     for one, two in order:
         laid = [
             _laid(xy, chains[one], chains[two], points, rows[i], rows[j], overlaps[one][i], overlaps[two][j])
-            for i in range(len(rows)) for j in range(len(rows)) if i != j
-        ]  # fmt: skip
+            for i in range(len(rows))
+            for j in range(len(rows))
+            if i != j
+        ]
         dots = np.concatenate([d for d, _ in laid])
         targets = np.concatenate([t for _, t in laid])
         poses = [np.empty((0, 4, 4))]
@@ -173,9 +175,15 @@ def row_hypotheses(
 
 
 def _laid(
-    xy: Array, one: IntArray, two: IntArray, points: Array, first: IntArray, second: IntArray,
-    on_first: list[_Overlap], on_second: list[_Overlap],
-) -> tuple[IntArray, IntArray]:  # fmt: skip
+    xy: Array,
+    one: IntArray,
+    two: IntArray,
+    points: Array,
+    first: IntArray,
+    second: IntArray,
+    on_first: list[_Overlap],
+    on_second: list[_Overlap],
+) -> tuple[IntArray, IntArray]:
     """Five dots (ends of the first chain; ends and middle of the second) and their targets (k, 5), for all offsets."""
     u, v = points[first[-1]] - points[first[0]], points[second[-1]] - points[second[0]]
     p, q = xy[one[-1]] - xy[one[0]], xy[two[-1]] - xy[two[0]]
@@ -200,9 +208,6 @@ def _laid(
                 dots.append(some)
                 targets.append(named)
     return np.array(dots, dtype=np.int64).reshape(-1, 5), np.array(targets, dtype=np.int64).reshape(-1, 5)
-
-
-
 
 
 def _overlaps(chain: IntArray, row: IntArray) -> list[_Overlap]:

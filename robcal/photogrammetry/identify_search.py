@@ -158,9 +158,15 @@ def _dot_triples(semi_major: Array, diameters: Array) -> Iterator[IntArray]:
 
 
 def _best(
-    camera: Camera, poses: Array, xy: Array, semi_major: Array, tree: cKDTree, body: Body, candidates: IntArray,
+    camera: Camera,
+    poses: Array,
+    xy: Array,
+    semi_major: Array,
+    tree: cKDTree,
+    body: Body,
+    candidates: IntArray,
     tolerance: float,
-) -> list[tuple[float, Array]]:  # fmt: skip
+) -> list[tuple[float, Array]]:
     p = transform(poses[:, None], body.points[candidates])
     seen = project(camera, p)
     ok = np.asarray(np.isfinite(seen).all(axis=-1))
@@ -205,9 +211,15 @@ def match_dots(
 
 
 def _verify(
-    camera: Camera, xy: Array, covariance: Array, body: Body, candidates: IntArray, pool: list[tuple[float, Array]],
-    model_error_px: float, tried: int,
-) -> tuple[list[Found], str]:  # fmt: skip
+    camera: Camera,
+    xy: Array,
+    covariance: Array,
+    body: Body,
+    candidates: IntArray,
+    pool: list[tuple[float, Array]],
+    model_error_px: float,
+    tried: int,
+) -> tuple[list[Found], str]:
     """Refine the best hypotheses together, match again, and keep those that accidents would hardly produce."""
     m, n = len(xy), len(candidates)
     area = float(camera.width * camera.height)
@@ -233,9 +245,16 @@ def _verify(
         targets = candidates[np.concatenate([t for t, _ in matches])]
         rows = np.concatenate([r for _, r in matches])
         fit = refine_poses(
-            poses[list(unique.values())], which, np.zeros(len(rows), dtype=np.int64), [camera], np.eye(4)[None],
-            body.points[targets], xy[rows], C[rows], iterations=10,
-        )  # fmt: skip
+            poses[list(unique.values())],
+            which,
+            np.zeros(len(rows), dtype=np.int64),
+            [camera],
+            np.eye(4)[None],
+            body.points[targets],
+            xy[rows],
+            C[rows],
+            iterations=10,
+        )
         poses, cost = fit.reference_T_body, fit.cost
     found: list[Found] = []
     why = "no arrangement of the dots fits the body"

@@ -64,8 +64,9 @@ def identify_station(
     """
     sizes = {
         name: (next(iter(images.values())).shape[1], next(iter(images.values())).shape[0])
-        for name, images in detections.items() if images
-    }  # fmt: skip
+        for name, images in detections.items()
+        if images
+    }
     start = {n: c if (c := cameras.get(n)) is not None else Camera.from_size(*sizes[n]) for n in sizes}
     loose = {n: model_error_px if cameras.get(n) is not None else 4.0 * model_error_px for n in sizes}
     found: dict[tuple[str, int], IdentifiedImage] = {}
@@ -87,9 +88,7 @@ def identify_station(
 
 
 def with_recurring_codes(
-    found: Mapping[tuple[str, int], IdentifiedImage],
-    detections: Mapping[str, Mapping[int, Detections]],
-    body: Body,
+    found: Mapping[tuple[str, int], IdentifiedImage], detections: Mapping[str, Mapping[int, Detections]], body: Body
 ) -> dict[tuple[str, int], IdentifiedImage]:
     """The images with those codes that the pose of nearly every image contradicts: no misreading recurs like that.
 
@@ -227,9 +226,13 @@ def _second_round(
             ):
                 again[pose] = prediction
         images = identify_images(
-            [detections[name][pose] for pose in again], body, camera, predictions=[[p] for p in again.values()],
-            model_error_px=max(0.5, ratio), search=False,
-        )  # fmt: skip
+            [detections[name][pose] for pose in again],
+            body,
+            camera,
+            predictions=[[p] for p in again.values()],
+            model_error_px=max(0.5, ratio),
+            search=False,
+        )
         for pose, image in zip(again, images, strict=True):
             before = found[name, pose]
             if len(image.rows) > len(before.rows) or before.method == "none":
@@ -237,9 +240,14 @@ def _second_round(
 
 
 def _prediction(
-    found: Mapping[tuple[str, int], IdentifiedImage], detections: Mapping[str, Mapping[int, Detections]], body: Body,
-    orientation: StationOrientation, name: str, pose: int, error_px: float,
-) -> Prediction | None:  # fmt: skip
+    found: Mapping[tuple[str, int], IdentifiedImage],
+    detections: Mapping[str, Mapping[int, Detections]],
+    body: Body,
+    orientation: StationOrientation,
+    name: str,
+    pose: int,
+    error_px: float,
+) -> Prediction | None:
     """Where the oriented station expects the body before a camera.
 
     Where the images of a pose contradict one another none was oriented: then codes are believed rather than a search.

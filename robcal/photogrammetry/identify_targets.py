@@ -81,9 +81,14 @@ def identify_targets(
         may decide between numberings of a regular body.
     """
     return identify_images(
-        [detections], body, camera, predictions=[predictions], model_error_px=model_error_px, search=search,
+        [detections],
+        body,
+        camera,
+        predictions=[predictions],
+        model_error_px=model_error_px,
+        search=search,
         others=others,
-    )[0]  # fmt: skip
+    )[0]
 
 
 def identify_images(
@@ -114,16 +119,21 @@ def identify_images(
     for (k, _), image in zip(tasks, _extended(body, camera, [start for _, start in tasks]), strict=True):
         out[k] = image
     return [
-        image if image is not None
+        image
+        if image is not None
         else _without_codes(images[k], body, camera, coded[k], expected[k], model_error_px, search, others)
         for k, image in enumerate(out)
-    ]  # fmt: skip
+    ]
 
 
 def _resected(
-    images: Sequence[Detections], coded: Sequence[tuple[IntArray, IntArray]], placed: Sequence[NDArray[np.bool_]],
-    body: Body, camera: Camera, model_error_px: float,
-) -> dict[int, Resection]:  # fmt: skip
+    images: Sequence[Detections],
+    coded: Sequence[tuple[IntArray, IntArray]],
+    placed: Sequence[NDArray[np.bool_]],
+    body: Body,
+    camera: Camera,
+    model_error_px: float,
+) -> dict[int, Resection]:
     """Poses of the images with four or more coded targets of known place, by number of the image; ``inliers`` count
     the image's own ``placed`` codes."""
     several = [k for k, mask in enumerate(placed) if mask.sum() >= 4]
@@ -137,14 +147,21 @@ def _resected(
     found = resect_images(camera, number, ids, xy, covariance, body, model_error_px=model_error_px)
     return {
         k: replace(fit, inliers=fit.inliers[number == i])
-        for i, (k, fit) in enumerate(zip(several, found, strict=True)) if isinstance(fit, Resection)
-    }  # fmt: skip
+        for i, (k, fit) in enumerate(zip(several, found, strict=True))
+        if isinstance(fit, Resection)
+    }
 
 
 def _without_codes(
-    detections: Detections, body: Body, camera: Camera, coded: tuple[IntArray, IntArray],
-    predictions: Sequence[Prediction], model_error_px: float, search: bool, others: Sequence[View],
-) -> IdentifiedImage:  # fmt: skip
+    detections: Detections,
+    body: Body,
+    camera: Camera,
+    coded: tuple[IntArray, IntArray],
+    predictions: Sequence[Prediction],
+    model_error_px: float,
+    search: bool,
+    others: Sequence[View],
+) -> IdentifiedImage:
     """One image whose codes give no pose: by predictions, then by its geometry."""
     rows, ids = coded
     placed = body.known[body.index(ids)] if len(ids) else np.zeros(0, dtype=bool)
@@ -165,13 +182,17 @@ def _without_codes(
             if grid.method != "none" or grid.alternatives:
                 return _joined(rows, ids, grid)
         found, why = search_body(
-            camera, detections.xy[dots], detections.covariance[dots], detections.semi_axes[dots, 0], body, candidates,
-            model_error_px=model_error_px, max_hypotheses=120_000 if len(dots) <= _CROWD else 30_000,
-        )  # fmt: skip
+            camera,
+            detections.xy[dots],
+            detections.covariance[dots],
+            detections.semi_axes[dots, 0],
+            body,
+            candidates,
+            model_error_px=model_error_px,
+            max_hypotheses=120_000 if len(dots) <= _CROWD else 30_000,
+        )
         if len(found) == 1:
-            single = IdentifiedImage(
-                dots[found[0].rows], body.ids[found[0].targets], found[0].camera_T_body, "search"
-            )
+            single = IdentifiedImage(dots[found[0].rows], body.ids[found[0].targets], found[0].camera_T_body, "search")
             return _joined(rows, ids, single)
         if len(found) > 1:
             return IdentifiedImage(
@@ -198,15 +219,26 @@ def _joined(rows: IntArray, ids: IntArray, found: IdentifiedImage) -> Identified
 
 
 def _from_rows(
-    detections: Detections, body: Body, camera: Camera, candidates: IntArray, dots: IntArray, model_error_px: float,
+    detections: Detections,
+    body: Body,
+    camera: Camera,
+    candidates: IntArray,
+    dots: IntArray,
+    model_error_px: float,
     others: Sequence[View],
-) -> IdentifiedImage:  # fmt: skip
+) -> IdentifiedImage:
     """The search by rows of dots: one numbering, several (refused), or nothing with a reason."""
     size = np.sqrt(detections.semi_axes[dots].prod(axis=1))
     found, why = search_grid(
-        camera, detections.xy[dots], size, detections.contrast[dots], body, candidates,
-        model_error_px=model_error_px, others=others,
-    )  # fmt: skip
+        camera,
+        detections.xy[dots],
+        size,
+        detections.contrast[dots],
+        body,
+        candidates,
+        model_error_px=model_error_px,
+        others=others,
+    )
     none = np.empty(0, dtype=np.int64)
     if len(found) != 1:
         poses = tuple(f.camera_T_body for f in found)
@@ -217,9 +249,15 @@ def _from_rows(
     covariance = detections.covariance[rows] + best.rms**2 * np.eye(2)
     # the pose that belongs to the camera as given, not to the lens adjusted on the way
     fit = refine_poses(
-        best.camera_T_body[None], zero, zero, [camera], np.eye(4)[None], body.points[targets], detections.xy[rows],
+        best.camera_T_body[None],
+        zero,
+        zero,
+        [camera],
+        np.eye(4)[None],
+        body.points[targets],
+        detections.xy[rows],
         covariance,
-    )  # fmt: skip
+    )
     view = view_of(best, body.points[candidates])
     return IdentifiedImage(rows, body.ids[targets], fit.reference_T_body[0], "rows", view=view)
 
@@ -325,10 +363,17 @@ def _extended(body: Body, camera: Camera, starts: Sequence[_Start]) -> list[Iden
             xy.append(g.start.detections.xy[rows[mask]])
             covariance.append(g.start.detections.covariance[rows[mask]] + g.error**2 * np.eye(2))
         fit = refine_poses(
-            np.array([g.pose for g, _ in matched]), pose, np.zeros(len(pose), dtype=np.int64), [camera],
-            np.eye(4)[None], body.points[at], np.concatenate(xy), np.concatenate(covariance),
-            radius=0.5 * body.diameters[at], normals=normals[at],
-        )  # fmt: skip
+            np.array([g.pose for g, _ in matched]),
+            pose,
+            np.zeros(len(pose), dtype=np.int64),
+            [camera],
+            np.eye(4)[None],
+            body.points[at],
+            np.concatenate(xy),
+            np.concatenate(covariance),
+            radius=0.5 * body.diameters[at],
+            normals=normals[at],
+        )
         for k, (g, (rows, ids)) in enumerate(matched):
             g.take(rows, ids, fit, k)
     return [IdentifiedImage(g.rows, g.ids, g.pose, g.start.method) for g in images]
@@ -370,4 +415,3 @@ def predict_dots(
     ringed = np.array([code == "ring12" for code in body.codes], dtype=bool)[targets] & np.isfinite(size)
     gate = np.where(ringed, np.minimum(gate, np.maximum(_INSIDE_RING * size, _LEAST_GATE)), gate)
     return xy, gate, size
-

@@ -12,13 +12,7 @@ from scipy import stats
 
 from robcal.errors import DegenerateGeometry, InvalidInput
 from robcal.photogrammetry.bodies import Body, IntArray, line_ratio
-from robcal.photogrammetry.distance_criterion import (
-    PairTable,
-    body_pair_variance,
-    culprits,
-    make_pairs,
-    robust_scale,
-)
+from robcal.photogrammetry.distance_criterion import PairTable, body_pair_variance, culprits, make_pairs, robust_scale
 from robcal.photogrammetry.frame_fit import FrameFit, fit_frames
 from robcal.photogrammetry.measured_points import MeasuredPoints, RejectedPoint
 from robcal.photogrammetry.recurring import Recurring, find_recurring
@@ -99,11 +93,7 @@ class MeasuredFrames:
 
 
 def measure_frames(
-    points: MeasuredPoints,
-    body: Body | None = None,
-    *,
-    tolerance: float | None = None,
-    sigma_factor: float = 4.0,
+    points: MeasuredPoints, body: Body | None = None, *, tolerance: float | None = None, sigma_factor: float = 4.0
 ) -> MeasuredFrames:
     """Frames of a body from its measured targets.
 
@@ -164,9 +154,7 @@ def measure_frames(
         scale = float(np.sqrt(fit.chi2.sum() / fit.redundancy.sum()))
         sigma *= scale
         fit = replace(fit, covariance=fit.covariance * scale**2, chi2=fit.chi2 / scale**2)
-    reasons = [
-        _bad_fit(fit.chi2[i], int(fit.redundancy[i]), fit.covariance[i], factor) for i in range(len(fit.pose))
-    ]
+    reasons = [_bad_fit(fit.chi2[i], int(fit.redundancy[i]), fit.covariance[i], factor) for i in range(len(fit.pose))]
     misfits = [r is not None and r.startswith(_MISFIT) for r in reasons]
     if sum(misfits) > _TOO_MANY * len(reasons):
         notes.append(f"in {sum(misfits)} of {len(reasons)} poses the body does not fit: evidence, not rejected")
@@ -187,9 +175,17 @@ def measure_frames(
         reason = rejected_poses[0].reason if rejected_poses else "no points of the body"
         raise DegenerateGeometry(f"no pose carries a frame of body {body.name}: {reason}")
     return MeasuredFrames(
-        **out, rejected_poses=tuple(rejected_poses), rejected_points=tuple(rejected), pairs=judged,
-        recurring=recurring, left_out=left_out, noise_factor=factor, body=body, sigma=sigma, notes=tuple(notes),
-    )  # fmt: skip
+        **out,
+        rejected_poses=tuple(rejected_poses),
+        rejected_points=tuple(rejected),
+        pairs=judged,
+        recurring=recurring,
+        left_out=left_out,
+        noise_factor=factor,
+        body=body,
+        sigma=sigma,
+        notes=tuple(notes),
+    )
 
 
 def _station(points: MeasuredPoints, at: IntArray) -> Array | None:
@@ -296,9 +292,10 @@ def _eliminate(
                     size = (judged.measured[k] - judged.expected[k]) / judged.sigma[k]
                     badness[i, j] = badness[j, i] = size**2
             bad = [
-                (local[int(table.first[k])], local[int(table.second[k])]) for k in violated[q]
+                (local[int(table.first[k])], local[int(table.second[k])])
+                for k in violated[q]
                 if int(table.first[k]) in local and int(table.second[k]) in local
-            ]  # fmt: skip
+            ]
             gone = culprits(len(rows), bad, badness)
             if gone is None:
                 keep[rows] = False
@@ -357,8 +354,12 @@ def _assemble(points: MeasuredPoints, fit: FrameFit, good: NDArray[np.bool_], me
         redundancy = np.concatenate([redundancy, np.zeros(new.sum(), dtype=np.int64)])
     order = np.argsort(pose, kind="stable")
     return {
-        "pose": pose[order], "world_T_body": T[order], "covariance": C[order], "common_covariance": common[order],
-        "method": tuple(methods[i] for i in order), "targets": tuple(targets[i] for i in order),
-        "chi2": chi2[order], "redundancy": redundancy[order],
-    }  # fmt: skip
-
+        "pose": pose[order],
+        "world_T_body": T[order],
+        "covariance": C[order],
+        "common_covariance": common[order],
+        "method": tuple(methods[i] for i in order),
+        "targets": tuple(targets[i] for i in order),
+        "chi2": chi2[order],
+        "redundancy": redundancy[order],
+    }

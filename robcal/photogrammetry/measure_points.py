@@ -63,16 +63,27 @@ def measure_points(
     width = 6 * e + 9 * c
     empty = np.empty((0, 3))
     pose_of, target_of, p, C, n_cam, res, J = (
-        np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), empty, np.empty((0, 3, 3)),
-        np.empty(0, dtype=np.int64), np.empty(0), np.empty((0, 3, width)),
-    )  # fmt: skip
+        np.empty(0, dtype=np.int64),
+        np.empty(0, dtype=np.int64),
+        empty,
+        np.empty((0, 3, 3)),
+        np.empty(0, dtype=np.int64),
+        np.empty(0),
+        np.empty((0, 3, width)),
+    )
     inconsistent: tuple[int, ...] = ()
     if len(sub_keys):
         covariance = table.covariance[several] * noise[several][:, None, None]
         out = intersect(
-            sub_point, table.camera[several], xy[several], covariance, orientation.cameras,
-            orientation.world_T_exterior, exterior=table.exterior[several], critical=critical,
-        )  # fmt: skip
+            sub_point,
+            table.camera[several],
+            xy[several],
+            covariance,
+            orientation.cameras,
+            orientation.world_T_exterior,
+            exterior=table.exterior[several],
+            critical=critical,
+        )
         pose_of = poses[sub_keys // (len(carried) + 1)]
         target_of = carried.ids[sub_keys % (len(carried) + 1)]
         keep, inconsistent = _consistent(
@@ -106,9 +117,18 @@ def measure_points(
         J = np.concatenate([J[~drop], zero])
     order = np.lexsort((carried.index(target_of), pose_of))
     return MeasuredPoints(
-        pose_of[order], target_of[order], p[order], C[order], n_cam[order], res[order], J[order],
-        orientation.covariance, resected, tuple(rejected), inconsistent,
-    )  # fmt: skip
+        pose_of[order],
+        target_of[order],
+        p[order],
+        C[order],
+        n_cam[order],
+        res[order],
+        J[order],
+        orientation.covariance,
+        resected,
+        tuple(rejected),
+        inconsistent,
+    )
 
 
 def _table(
@@ -125,19 +145,19 @@ def _table(
         target = body.index(m.target)
         keep = target >= 0
         if banned:
-            keep &= np.array(
-                [
-                    (name, int(p), int(t)) not in banned
-                    for p, t in zip(m.pose, m.target, strict=True)
-                ]
-            )
+            keep &= np.array([(name, int(p), int(t)) not in banned for p, t in zip(m.pose, m.target, strict=True)])
         n = int(keep.sum())
         columns.append(
             (
-                np.full(n, c), orientation.exterior_of(c, m.pose[keep]), m.pose[keep], target[keep], m.xy[keep],
-                m.covariance[keep], np.full(n, orientation.noise[name] ** 2),
+                np.full(n, c),
+                orientation.exterior_of(c, m.pose[keep]),
+                m.pose[keep],
+                target[keep],
+                m.xy[keep],
+                m.covariance[keep],
+                np.full(n, orientation.noise[name] ** 2),
             )
-        )  # fmt: skip
+        )
     if not columns:
         raise DegenerateGeometry("none of the cameras of the orientation has marks")
     camera, exterior, number, target, xy, covariance, noise = (np.concatenate(v) for v in zip(*columns, strict=True))
@@ -176,9 +196,15 @@ def _centred(
 
 
 def _consistent(
-    chi2: Array, n_cameras: IntArray, p: Array, pose: IntArray, target: IntArray, critical: float,
-    rejected: list[RejectedPoint], suspect: set[int],
-) -> tuple[NDArray[np.bool_], tuple[int, ...]]:  # fmt: skip
+    chi2: Array,
+    n_cameras: IntArray,
+    p: Array,
+    pose: IntArray,
+    target: IntArray,
+    critical: float,
+    rejected: list[RejectedPoint],
+    suspect: set[int],
+) -> tuple[NDArray[np.bool_], tuple[int, ...]]:
     """Points whose rays agree. Where most points of a pose fail it is not the points: they stay, the pose is named;
     but in a ``suspect`` pose, whose images the orientation found to contradict one another, they go."""
     level = 2 * stats.norm.sf(critical)
@@ -215,9 +241,14 @@ def _weak_poses(poses: IntArray, pose_of: IntArray, target_of: IntArray, body: B
 
 
 def _resect_poses(
-    orientation: StationOrientation, table: MarkTable, number: IntArray, noise: Array, wanted: IntArray, body: Body,
+    orientation: StationOrientation,
+    table: MarkTable,
+    number: IntArray,
+    noise: Array,
+    wanted: IntArray,
+    body: Body,
     rejected: list[RejectedPoint],
-) -> ResectedPoses | None:  # fmt: skip
+) -> ResectedPoses | None:
     use = np.isin(number, wanted) & body.known[table.target]
     if not use.any():
         return None
@@ -252,9 +283,10 @@ def _resect_poses(
         redundancy = int(best_fit.redundancy[best])
         variance = max(1.0, best_fit.cost[best] / max(1, redundancy))
         distinct = [
-            k for k in candidates[1:]
+            k
+            for k in candidates[1:]
             if np.trace(best_fit.reference_T_body[k][:3, :3].T @ best_fit.reference_T_body[best][:3, :3]) < 3 - 1e-4
-        ]  # fmt: skip
+        ]
         if redundancy <= 0:
             rejected.append(RejectedPoint(int(q), -1, "resection: three marks alone cannot be verified"))
         elif stats.chi2.sf(best_fit.cost[best], redundancy) < 1e-9:
@@ -272,38 +304,64 @@ def _resect_poses(
     common = _common_covariance(orientation, table, scaled, best_fit.reference_T_body, which, tile, body)
     seen_by = [np.unique(table.camera[tile[which == k]]) for k in chosen]
     return ResectedPoses(
-        own[chosen], best_fit.reference_T_body[chosen], best_fit.covariance[chosen], common[chosen],
+        own[chosen],
+        best_fit.reference_T_body[chosen],
+        best_fit.covariance[chosen],
+        common[chosen],
         np.array([len(s) for s in seen_by], dtype=np.int64),
         tuple(tuple(sorted({int(i) for i in body.ids[table.target[tile[which == k]]]})) for k in chosen),
-    )  # fmt: skip
+    )
 
 
 def _fit_all(
-    orientation: StationOrientation, table: MarkTable, scaled: Array, number: IntArray, rows: IntArray,
-    starts: list[tuple[int, Array]], body: Body,
-) -> tuple[PoseFit, IntArray, IntArray]:  # fmt: skip
+    orientation: StationOrientation,
+    table: MarkTable,
+    scaled: Array,
+    number: IntArray,
+    rows: IntArray,
+    starts: list[tuple[int, Array]],
+    body: Body,
+) -> tuple[PoseFit, IntArray, IntArray]:
     """Refine all start poses with the marks of all cameras: fit, start number and table row of each mark used."""
     tiles = [rows[number[rows] == q] for q, _ in starts]
     tile = np.concatenate(tiles)
     which = np.repeat(np.arange(len(starts)), [len(t) for t in tiles])
     fit = refine_poses(
-        np.array([T for _, T in starts]), which, table.exterior[tile],
-        [orientation.cameras[c] for c in orientation.exterior_camera], orientation.world_T_exterior,
-        body.points[table.target[tile]], table.xy[tile], scaled[tile],
-        radius=table.radius[tile], normals=table.normals[tile], iterations=25,
-    )  # fmt: skip
+        np.array([T for _, T in starts]),
+        which,
+        table.exterior[tile],
+        [orientation.cameras[c] for c in orientation.exterior_camera],
+        orientation.world_T_exterior,
+        body.points[table.target[tile]],
+        table.xy[tile],
+        scaled[tile],
+        radius=table.radius[tile],
+        normals=table.normals[tile],
+        iterations=25,
+    )
     return fit, which, tile
 
 
 def _common_covariance(
-    orientation: StationOrientation, table: MarkTable, scaled: Array, poses: Array, which: IntArray, tile: IntArray,
+    orientation: StationOrientation,
+    table: MarkTable,
+    scaled: Array,
+    poses: Array,
+    which: IntArray,
+    tile: IntArray,
     body: Body,
-) -> Array:  # fmt: skip
+) -> Array:
     """(k, 6, 6) what the uncertainty of station and body adds to resected poses."""
     marks = MarkTable(
-        table.camera[tile], table.exterior[tile], which, table.target[tile], table.xy[tile], scaled[tile],
-        table.radius[tile], table.normals[tile],
-    )  # fmt: skip
+        table.camera[tile],
+        table.exterior[tile],
+        which,
+        table.target[tile],
+        table.xy[tile],
+        scaled[tile],
+        table.radius[tile],
+        table.normals[tile],
+    )
     interior = np.array([camera.vector for camera in orientation.cameras])
     unknowns = Unknowns(interior, orientation.world_T_exterior, poses, np.nan_to_num(body.points))
     ones = np.ones(len(orientation.names))

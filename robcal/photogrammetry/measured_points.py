@@ -85,10 +85,13 @@ class MeasuredPoints:
         """Points of any measuring system; ``covariance`` (m, 3, 3) m^2 or None."""
         m = len(pose)
         return cls(
-            np.asarray(pose, dtype=np.int64), np.asarray(target, dtype=np.int64), np.asarray(p_world, dtype=float),
+            np.asarray(pose, dtype=np.int64),
+            np.asarray(target, dtype=np.int64),
+            np.asarray(p_world, dtype=float),
             None if covariance is None else np.asarray(covariance, dtype=float),
-            np.zeros(m, dtype=np.int64), np.full(m, np.nan),
-        )  # fmt: skip
+            np.zeros(m, dtype=np.int64),
+            np.full(m, np.nan),
+        )
 
     @property
     def total_covariance(self) -> Array | None:

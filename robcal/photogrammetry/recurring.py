@@ -138,8 +138,11 @@ def find_recurring(
         # the single poses' noise averages out of the scale, the station's and the body's part do not
         scale_sigma = float(np.hypot(scale_sigma, np.median(np.sqrt(shared) / d_file)))
     bad = np.abs(left) > _SIGNIFICANT * s
-    found = [RecurringPair(int(body.ids[i]), int(body.ids[j]), float(x), float(y), int(k))
-             for i, j, x, y, k in zip(a, b, deviation, s, n, strict=True) if abs(x) > _SIGNIFICANT * y]  # fmt: skip
+    found = [
+        RecurringPair(int(body.ids[i]), int(body.ids[j]), float(x), float(y), int(k))
+        for i, j, x, y, k in zip(a, b, deviation, s, n, strict=True)
+        if abs(x) > _SIGNIFICANT * y
+    ]
     seen = np.unique(np.concatenate([a, b]))
     at = {int(i): k for k, i in enumerate(seen)}
     badness = np.zeros((len(seen), len(seen)))
@@ -148,17 +151,23 @@ def find_recurring(
     violated = [(at[int(i)], at[int(j)]) for i, j in zip(a[bad], b[bad], strict=True)]
     removed = culprits(len(seen), violated, badness)
     unexplained = tuple(
-        f for f, i, j in ((f, at[int(body.index([f.first])[0])], at[int(body.index([f.second])[0])]) for f in found)
+        f
+        for f, i, j in ((f, at[int(body.index([f.first])[0])], at[int(body.index([f.second])[0])]) for f in found)
         if removed is None and (i, j) in violated
-    )  # fmt: skip
+    )
     stay = np.array([int(i) for i in seen if at[int(i)] not in (removed or set())])
     stay = _off_the_plane(body, mean, sigma, stay, 1.0 + scale, float(np.median(shared)))
     gone = [int(i) for i in seen if i not in stay]
     targets = _shifts(body, mean, sigma, stay, gone, 1.0 + scale) if gone and removed is not None else ()
     return Recurring(
-        tuple(found), targets, 1e6 * scale if scale else None, 1e6 * scale_sigma if scale else None, unexplained, mean,
+        tuple(found),
+        targets,
+        1e6 * scale if scale else None,
+        1e6 * scale_sigma if scale else None,
+        unexplained,
+        mean,
         _statement(body, targets, scale, unexplained),
-    )  # fmt: skip
+    )
 
 
 def _inflation(z: Array) -> float:
@@ -170,9 +179,7 @@ def _inflation(z: Array) -> float:
     return max(1.0, float(np.quantile(np.abs(z), 0.2)) / 0.2533) if len(z) >= 5 else 1.0
 
 
-def _off_the_plane(
-    body: Body, mean: Array, sigma: Array, stay: IntArray, scale: float, shared: float
-) -> IntArray:
+def _off_the_plane(body: Body, mean: Array, sigma: Array, stay: IntArray, scale: float, shared: float) -> IntArray:
     """Targets that stay after those are taken away whose place in space is off although their distances are not.
 
     A shift across a plane changes distances only to second order. Each target is compared with the others' fit.

@@ -350,10 +350,18 @@ def _refine_tasks(data: _Marks, tasks: list[tuple[int, Array, IntArray]], k: int
     rows = np.concatenate([task[2] for task in tasks])
     which = np.repeat(np.arange(len(tasks)), [len(task[2]) for task in tasks])
     fit = refine_poses(
-        np.array([task[1] for task in tasks]), which, np.zeros(len(rows), dtype=np.int64), [data.camera],
-        np.eye(4)[None], data.points[rows], data.xy[rows], data.covariance[rows],
-        radius=data.radius[rows], normals=data.normals[rows], iterations=25,
-    )  # fmt: skip
+        np.array([task[1] for task in tasks]),
+        which,
+        np.zeros(len(rows), dtype=np.int64),
+        [data.camera],
+        np.eye(4)[None],
+        data.points[rows],
+        data.xy[rows],
+        data.covariance[rows],
+        radius=data.radius[rows],
+        normals=data.normals[rows],
+        iterations=25,
+    )
     for j, (i, _, _) in enumerate(tasks):
         if np.isfinite(fit.cost[j]):
             solutions[i].append(_Solution(fit.reference_T_body[j], fit.covariance[j], float(fit.cost[j])))

@@ -52,10 +52,7 @@ def needs_normals(body: Body) -> bool:
 
 
 def with_seen_normals(
-    body: Body,
-    orientation: StationOrientation,
-    marks: Mapping[str, StationMarks],
-    ellipses: Mapping[str, Ellipses],
+    body: Body, orientation: StationOrientation, marks: Mapping[str, StationMarks], ellipses: Mapping[str, Ellipses]
 ) -> Body:
     """The body with outward normals from the ellipses of all cameras, where its shape does not tell them.
 

@@ -98,13 +98,7 @@ class _Builder:
     """Marks of one body and the steps that place images and targets."""
 
     def __init__(
-        self,
-        marks: ImageMarks,
-        images: int,
-        targets: int,
-        camera: Camera,
-        focal_known: bool,
-        rng: np.random.Generator,
+        self, marks: ImageMarks, images: int, targets: int, camera: Camera, focal_known: bool, rng: np.random.Generator
     ) -> None:
         self.marks, self.images, self.targets = marks, images, targets
         self.camera, self.focal_known, self.rng = camera, focal_known, rng

@@ -172,9 +172,7 @@ def _usable(name: str, marks: StationMarks, body: Body) -> StationMarks:
     return StationMarks(marks.pose[keep], marks.target[keep], marks.xy[keep], marks.covariance[keep])
 
 
-def _lens_evidence(
-    state: StationState, adjusted: Adjusted, given: Mapping[str, Camera | None]
-) -> tuple[Evidence, ...]:
+def _lens_evidence(state: StationState, adjusted: Adjusted, given: Mapping[str, Camera | None]) -> tuple[Evidence, ...]:
     """Groups that are zero in a camera's file and yet significant in the images."""
     out: list[Evidence] = []
     e = len(state.exterior_camera)
@@ -254,9 +252,7 @@ def _result(
         rms_px=float(np.sqrt(np.mean(pixels**2))),
         rejected=rejected,
         evidence=evidence,
-        free_interior={
-            name: tuple(g for g in GROUPS if g in state.groups[i]) for i, name in enumerate(state.names)
-        },
+        free_interior={name: tuple(g for g in GROUPS if g in state.groups[i]) for i, name in enumerate(state.names)},
         converged=adjusted.converged,
         iterations=adjusted.iterations,
     )

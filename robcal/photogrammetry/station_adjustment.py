@@ -48,9 +48,18 @@ def interior_prior(camera: Camera) -> Array:
     side = max(camera.width, camera.height)
     corner = 0.5 * np.hypot(camera.width, camera.height) / f
     return np.array(
-        [0.2 * f, 0.01 * f, 0.1 * side, 0.1 * side, 0.3 / corner**2, 0.3 / corner**4, 0.02 / corner, 0.02 / corner,
-         0.3 / corner**6]
-    )  # fmt: skip
+        [
+            0.2 * f,
+            0.01 * f,
+            0.1 * side,
+            0.1 * side,
+            0.3 / corner**2,
+            0.3 / corner**4,
+            0.02 / corner,
+            0.02 / corner,
+            0.3 / corner**6,
+        ]
+    )
 
 
 @dataclass(frozen=True)
@@ -348,9 +357,18 @@ def adjust_station(
     inverse = np.zeros_like(system.reduced)
     inverse[np.ix_(on, on)] = _solve_scaled(system.reduced[np.ix_(on, on)], system.right[on], active_names)[1]
     design = StationDesign(
-        clean.residual, clean.by_exterior, clean.by_interior, clean.by_point, clean.by_pose, lin.whitening, weights,
-        active, inverse, system.pose_inverse, system.coupling,
-    )  # fmt: skip
+        clean.residual,
+        clean.by_exterior,
+        clean.by_interior,
+        clean.by_point,
+        clean.by_pose,
+        lin.whitening,
+        weights,
+        active,
+        inverse,
+        system.pose_inverse,
+        system.coupling,
+    )
     mark_cost = float(np.sum(clean.residual**2))
     return Adjusted(x, design, mark_cost, _prior_terms(x, prior)[2], iterations, converged)
 
@@ -375,8 +393,9 @@ def covariance_blocks(design: StationDesign, marks: MarkTable, e: int, c: int) -
     for rows in _groups(group):
         at = columns[rows[0]]
         own = A[rows]
-        covariance[rows] = np.matmul((own.reshape(-1, 18) @ Q[np.ix_(at, at)]).reshape(own.shape),
-                                     own.transpose(0, 2, 1))  # fmt: skip
+        covariance[rows] = np.matmul(
+            (own.reshape(-1, 18) @ Q[np.ix_(at, at)]).reshape(own.shape), own.transpose(0, 2, 1)
+        )
         both = np.matmul(own, Qgp[np.ix_(at, marks.pose[rows])].transpose(1, 0, 2))
         cross = np.matmul(both, B[rows].transpose(0, 2, 1))
         covariance[rows] += cross + cross.transpose(0, 2, 1)

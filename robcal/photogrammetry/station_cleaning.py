@@ -64,11 +64,14 @@ def _drop_image(state: StationState, found: Evidence) -> list[RejectedMark]:
     pose = int(state.poses[column])
     return [
         RejectedMark(
-            state.names[c], pose, -1, f"image contradicts the other cameras (chi-square {found.statistic:.0f})",
+            state.names[c],
+            pose,
+            -1,
+            f"image contradicts the other cameras (chi-square {found.statistic:.0f})",
             "contradiction",
         )
         for c in which
-    ]  # fmt: skip
+    ]
 
 
 def _strongest(state: StationState, adjusted: Adjusted) -> Evidence | None:
@@ -93,9 +96,7 @@ def _strongest(state: StationState, adjusted: Adjusted) -> Evidence | None:
             if kind == "camera_moved" and c == 2:
                 text += "; with two cameras it may as well be the other one"
             candidates.append(
-                Evidence(
-                    kind, state.names[i], int(state.poses[k]), estimate, covariance, float(table[i, k]), 6, text
-                )
+                Evidence(kind, state.names[i], int(state.poses[k]), estimate, covariance, float(table[i, k]), 6, text)
             )
     if state.settings.detect_targets and state.prior.points_weight is not None:
         found = _worst_target(state, adjusted)
@@ -190,11 +191,13 @@ def snoop(state: StationState) -> tuple[Adjusted, tuple[RejectedMark, ...]]:
                 break
             rejected += [
                 RejectedMark(
-                    state.names[state.marks.camera[i]], int(state.poses[state.marks.pose[i]]),
-                    int(state.body.ids[state.marks.target[i]]), f"residual {np.sqrt(T2[i]):.1f} standard deviations",
+                    state.names[state.marks.camera[i]],
+                    int(state.poses[state.marks.pose[i]]),
+                    int(state.body.ids[state.marks.target[i]]),
+                    f"residual {np.sqrt(T2[i]):.1f} standard deviations",
                 )
                 for i in np.flatnonzero(out)
-            ]  # fmt: skip
+            ]
             state.drop(out)
             adjusted = state.adjust(None)
             state.update_noise(adjusted, robust=robust)

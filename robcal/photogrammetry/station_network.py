@@ -168,9 +168,15 @@ class MarkTable:
     def select(self, rows: NDArray[np.bool_]) -> MarkTable:
         """The table reduced to some rows."""
         return MarkTable(
-            self.camera[rows], self.exterior[rows], self.pose[rows], self.target[rows], self.xy[rows],
-            self.covariance[rows], self.radius[rows], self.normals[rows],
-        )  # fmt: skip
+            self.camera[rows],
+            self.exterior[rows],
+            self.pose[rows],
+            self.target[rows],
+            self.xy[rows],
+            self.covariance[rows],
+            self.radius[rows],
+            self.normals[rows],
+        )
 
     def __len__(self) -> int:
         return len(self.camera)

@@ -171,9 +171,7 @@ def scan_targets(points: Array, given: Array, weight: Array, covariance: Array, 
         gain = S[:, at] @ inverse
         left = (pull - gain @ pull[at])[others]
         cross = S[at][:, others]
-        conditional = S[others[:, :, None], others[:, None, :]] - np.einsum(
-            "jka,ajl->jkl", gain[others], cross
-        )
+        conditional = S[others[:, :, None], others[:, None, :]] - np.einsum("jka,ajl->jkl", gain[others], cross)
         inner = _pseudo_inverse(conditional, np.median(floor[usable]))
         scan.rest[i] = float(np.median(np.einsum("ji,jik,jk->j", left, inner, left)))
     return scan

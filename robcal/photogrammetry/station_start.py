@@ -54,9 +54,15 @@ def focal_start(marks: StationMarks, body: Body, size: tuple[int, int], sigma_px
     def score(factor: float) -> float:
         camera = Camera.from_size(*size, focal_factor=factor)
         fits = resect_images(
-            camera, image, marks.target[rows], marks.xy[rows], marks.covariance[rows], body, gate=1e6,
+            camera,
+            image,
+            marks.target[rows],
+            marks.xy[rows],
+            marks.covariance[rows],
+            body,
+            gate=1e6,
             model_error_px=sigma_px,
-        )  # fmt: skip
+        )
         values = [r.chi2 / max(1, r.redundancy) if isinstance(r, Resection) else 1e12 for r in fits]
         return float(np.median(values))
 
@@ -114,9 +120,15 @@ def find_swap(
             m = marks[s.camera]
             rows = np.flatnonzero(m.pose == s.pose)
             fit = resect_images(
-                cameras[s.camera], np.zeros(len(rows), dtype=np.int64), m.target[rows], m.xy[rows], m.covariance[rows],
-                trial, gate=1e6, model_error_px=sigma_px,
-            )[0]  # fmt: skip
+                cameras[s.camera],
+                np.zeros(len(rows), dtype=np.int64),
+                m.target[rows],
+                m.xy[rows],
+                m.covariance[rows],
+                trial,
+                gate=1e6,
+                model_error_px=sigma_px,
+            )[0]
             values.append(fit.chi2 / max(1, fit.redundancy) if isinstance(fit, Resection) else 1e12)
         return float(np.median(values))
 
@@ -302,9 +314,15 @@ def start_bodies(
             parts["covariance"].append(m.covariance[s.rows] + sigma_px**2 * np.eye(2))
     joined = {name: np.concatenate(values) for name, values in parts.items()}
     fit = refine_poses(
-        np.array(candidates), joined["which"], joined["camera"], cameras, world_T_camera, joined["points"],
-        joined["xy"], joined["covariance"],
-    )  # fmt: skip
+        np.array(candidates),
+        joined["which"],
+        joined["camera"],
+        cameras,
+        world_T_camera,
+        joined["points"],
+        joined["xy"],
+        joined["covariance"],
+    )
     out: dict[int, tuple[Array, float, float, int]] = {}
     own = np.array(owner)
     for pose, images in by_pose.items():

@@ -80,9 +80,16 @@ class StationState:
     def adjust(self, huber: float | None, *, body: bool = True) -> Adjusted:
         """Adjust with the present marks, groups and noise; the state takes over the solution."""
         adjusted = adjust_station(
-            self.marks, self.unknowns, self.start, self.active(body=body), self.prior, self.noise,
-            self.unknown_names(), huber=huber, max_iterations=self.settings.max_iterations,
-        )  # fmt: skip
+            self.marks,
+            self.unknowns,
+            self.start,
+            self.active(body=body),
+            self.prior,
+            self.noise,
+            self.unknown_names(),
+            huber=huber,
+            max_iterations=self.settings.max_iterations,
+        )
         self.unknowns = adjusted.unknowns
         return adjusted
 
@@ -219,9 +226,15 @@ def assemble(
     target, radius, normals = table["target"], 0.5 * body.diameters, body.estimated_normals()
     exterior_camera, first = np.arange(len(names)), np.full(len(names), poses[0])
     mark_table = MarkTable(
-        table["camera"], table["camera"].copy(), table["pose"], target, table["xy"], table["covariance"],
-        radius[target], normals[target],
-    )  # fmt: skip
+        table["camera"],
+        table["camera"].copy(),
+        table["pose"],
+        target,
+        table["xy"],
+        table["covariance"],
+        radius[target],
+        normals[target],
+    )
     unknowns = Unknowns(
         np.array([camera.vector for camera in start]),
         np.array(exterior, dtype=float),
@@ -230,22 +243,42 @@ def assemble(
     )
     # without a file the prior is a lens without distortion, wherever the start values already are
     centre = [
-        camera.vector if given.get(name) is not None
-        else Camera(camera.width, camera.height, (f := 0.5 * (camera.fx + camera.fy)), f,
-                    0.5 * (camera.width - 1), 0.5 * (camera.height - 1)).vector
+        camera.vector
+        if given.get(name) is not None
+        else Camera(
+            camera.width,
+            camera.height,
+            (f := 0.5 * (camera.fx + camera.fy)),
+            f,
+            0.5 * (camera.width - 1),
+            0.5 * (camera.height - 1),
+        ).vector
         for name, camera in zip(names, start, strict=True)
-    ]  # fmt: skip
-    sigma = np.array([
-        interior_prior(camera) * (1.0 if given.get(name) is None else _TRUST)
-        for name, camera in zip(names, start, strict=True)
-    ])  # fmt: skip
+    ]
+    sigma = np.array(
+        [
+            interior_prior(camera) * (1.0 if given.get(name) is None else _TRUST)
+            for name, camera in zip(names, start, strict=True)
+        ]
+    )
     weight = body_weight(body, mark_table, unknowns, start, settings)
     tried, kept = interior_groups(names, given, settings)
     state = StationState(
-        names, tuple(start), body, settings, mark_table, unknowns,
-        Prior(np.array(centre), sigma, unknowns.points.copy(), weight), tried, kept, np.ones(len(names)),
-        exterior_camera, first, tuple(fixed), poses,
-    )  # fmt: skip
+        names,
+        tuple(start),
+        body,
+        settings,
+        mark_table,
+        unknowns,
+        Prior(np.array(centre), sigma, unknowns.points.copy(), weight),
+        tried,
+        kept,
+        np.ones(len(names)),
+        exterior_camera,
+        first,
+        tuple(fixed),
+        poses,
+    )
     for name, changes in settings.epochs.items():
         if name not in names:
             raise InvalidInput(f"epochs name a camera {name} that the station does not have: {', '.join(names)}")

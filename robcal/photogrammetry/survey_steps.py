@@ -156,9 +156,7 @@ class Survey:
         use &= located[np.maximum(self.data.assigned, 0)]
         marks = self.data.marks(np.flatnonzero(use))
         marks = replace(
-            marks,
-            image=np.searchsorted(image_rows, marks.image),
-            target=np.searchsorted(target_rows, marks.target),
+            marks, image=np.searchsorted(image_rows, marks.image), target=np.searchsorted(target_rows, marks.target)
         )
         stated = self.diameters()
         diameters, normals = None, None
@@ -255,9 +253,17 @@ class Survey:
             rows = [self.ids.index(i) for i in datum if i in self.ids]
             points[rows] = self.given_points()[rows]
         return self._adjust(
-            network.camera, poses, points, placed, located,
-            datum=datum, lengths=lengths, checks=checks, free=free, settings=settings,
-        )  # fmt: skip
+            network.camera,
+            poses,
+            points,
+            placed,
+            located,
+            datum=datum,
+            lengths=lengths,
+            checks=checks,
+            free=free,
+            settings=settings,
+        )
 
     def _spread(self, network: CameraNetwork) -> tuple[Array, Array, NDArray[np.bool_], NDArray[np.bool_]]:
         """Values of a network over all images and targets: stations, points, placed, located."""
@@ -448,9 +454,14 @@ class Survey:
             wish = InnerOver(tuple(known))
         settings = replace(self.adjust_settings, robust=False, snooping=False)
         network = self._readjust(
-            network, datum=wish, lengths=self.bars, checks=self.checks, free=network.free_intrinsics,
-            settings=settings, frame=frame,
-        )  # fmt: skip
+            network,
+            datum=wish,
+            lengths=self.bars,
+            checks=self.checks,
+            free=network.free_intrinsics,
+            settings=settings,
+            frame=frame,
+        )
         self._take_over(network)
         words = f"targets {sorted(datum)} held at their given coordinates" if isinstance(datum, tuple) else frame.words
         scale = f"{len(self.bars)} scale bars" if len(self.bars) else "the given coordinates"

@@ -79,10 +79,17 @@ def _bent_sight(data: ObservationData, axis: int) -> Family:
         }
 
     return Family(
-        "refraction", "camera", "station", letter, names, (2e-5, 1e-4, 1e-4, 1e-4), report,
+        "refraction",
+        "camera",
+        "station",
+        letter,
+        names,
+        (2e-5, 1e-4, 1e-4, 1e-4),
+        report,
         "The lines of sight of the station bend along {direction} (refraction), {curvature_per_km:.4f} per km",
-        displace=_warping(bent), weight=0.125,
-    )  # fmt: skip
+        displace=_warping(bent),
+        weight=0.125,
+    )
 
 
 def _bent_from_origin(axis: int) -> Family:
@@ -102,10 +109,17 @@ def _bent_from_origin(axis: int) -> Family:
         return {"curvature_per_km": 1e3 * float(v[0]), "term": term}
 
     return Family(
-        "refraction", "camera", "station", letter, ("curvature",), (2e-5,), report,
+        "refraction",
+        "camera",
+        "station",
+        letter,
+        ("curvature",),
+        (2e-5,),
+        report,
         "The lines of sight of the station bend along {direction} (refraction), {curvature_per_km:.4f} per km",
-        displace=_warping(bent), weight=0.125,
-    )  # fmt: skip
+        displace=_warping(bent),
+        weight=0.125,
+    )
 
 
 def _warped(data: ObservationData) -> Family:
@@ -126,11 +140,23 @@ def _warped(data: ObservationData) -> Family:
     def report(v: Array, c: Constants) -> dict[str, object]:
         terms = [f"{1e3 * value:.4g} mm * {name[:2]} along {name[3]}" for name, value in zip(names, v, strict=True)]
         middle = ", ".join(f"{m:.3f}" for m in centre)
-        return {"term": {"variables": ["x_m", "y_m", "z_m"], "kind": "formula",
-                         "formula": f"about ({middle}) m: " + " + ".join(terms)}}  # fmt: skip
+        return {
+            "term": {
+                "variables": ["x_m", "y_m", "z_m"],
+                "kind": "formula",
+                "formula": f"about ({middle}) m: " + " + ".join(terms),
+            }
+        }
 
     return Family(
-        "refraction", "camera", "station", None, names, (1e-4,) * len(names), report,
+        "refraction",
+        "camera",
+        "station",
+        None,
+        names,
+        (1e-4,) * len(names),
+        report,
         "The lines of sight of the station are bent (refraction): the measured space is warped",
-        displace=_warping(bent), weight=0.25,
-    )  # fmt: skip
+        displace=_warping(bent),
+        weight=0.25,
+    )

@@ -205,10 +205,7 @@ def _gravity(site: RobotSite) -> Iterator[Family]:
 
     def report(v: Array, c: Constants) -> dict[str, object]:
         # a turn (tx, ty) of the downward vector leans it towards x by -ty and towards y by tx
-        return {
-            "tilt_deg": float(np.hypot(*v)) * DEG,
-            "azimuth_deg": float(np.degrees(np.arctan2(v[0], -v[1]))),
-        }
+        return {"tilt_deg": float(np.hypot(*v)) * DEG, "azimuth_deg": float(np.degrees(np.arctan2(v[0], -v[1])))}
 
     yield Family(
         "base_tilt",

@@ -47,8 +47,7 @@ class CSource:
 
 
 def export_c(
-    model: RobotModel, prefix: str | None = None, statics: str = "one_step",
-    defaults: Mapping[str, float] | None = None,
+    model: RobotModel, prefix: str | None = None, statics: str = "one_step", defaults: Mapping[str, float] | None = None
 ) -> CSource:
     """C99 header and source of a robot.
 
@@ -155,17 +154,19 @@ def _tables(chain: Chain, world_T_base: Array) -> str:
 
     big = 1e30
     flags = ", ".join("1" if p else "0" for p in chain.prismatic)
-    return "\n".join([
-        "/* joint lines at zero position, positive sense of q */",
-        rows("AXIS", chain.axes),
-        rows("POINT", chain.points),
-        f"static const int PRISMATIC[N] = {{{flags}}};",
-        f"static const double LOWER[N] = {array(np.maximum(chain.lower, -big))};",
-        f"static const double UPPER[N] = {array(np.minimum(chain.upper, big))};",
-        frame("HOME", chain.home),
-        frame("WORLD_T_BASE", world_T_base),
-        frame("BASE_T_WORLD", invert(world_T_base)),
-    ])  # fmt: skip
+    return "\n".join(
+        [
+            "/* joint lines at zero position, positive sense of q */",
+            rows("AXIS", chain.axes),
+            rows("POINT", chain.points),
+            f"static const int PRISMATIC[N] = {{{flags}}};",
+            f"static const double LOWER[N] = {array(np.maximum(chain.lower, -big))};",
+            f"static const double UPPER[N] = {array(np.minimum(chain.upper, big))};",
+            frame("HOME", chain.home),
+            frame("WORLD_T_BASE", world_T_base),
+            frame("BASE_T_WORLD", invert(world_T_base)),
+        ]
+    )
 
 
 def _inverse_parts(chain: Chain) -> list[str]:

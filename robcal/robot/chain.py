@@ -77,9 +77,16 @@ def chain_of(model: RobotModel) -> Chain:
         frames.append(T)
         moved_by.append(len(names) - 1)
     return Chain(
-        tuple(names), np.array(prismatic, bool), np.array(axes), np.array(points), T, np.array(frames),
-        np.array(moved_by), np.array(lower), np.array(upper),
-    )  # fmt: skip
+        tuple(names),
+        np.array(prismatic, bool),
+        np.array(axes),
+        np.array(points),
+        T,
+        np.array(frames),
+        np.array(moved_by),
+        np.array(lower),
+        np.array(upper),
+    )
 
 
 def check_joint_angles(chain: Chain, q: ArrayLike) -> Array:

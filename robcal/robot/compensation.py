@@ -192,9 +192,7 @@ def compensate(
     state.remaining[~reachable] = np.nan
     with np.errstate(invalid="ignore"):
         converged = _size(chain, state.remaining) <= 10.0 * options.tolerance
-    return Compensation(
-        state.q, F_star, state.remaining, before, reachable, tuple(state.reason), converged, steps
-    )  # fmt: skip
+    return Compensation(state.q, F_star, state.remaining, before, reachable, tuple(state.reason), converged, steps)
 
 
 @dataclass
@@ -268,7 +266,12 @@ def _correct(
 
 
 def _search_on(
-    kernel: Kernel, chain: Chain, state: _State, every: PoseInputs, target: Array, near: Array,
+    kernel: Kernel,
+    chain: Chain,
+    state: _State,
+    every: PoseInputs,
+    target: Array,
+    near: Array,
     options: CompensationSettings,
 ) -> None:
     """Rows that the correction did not solve, on the real model itself: damped least squares within the limits.

@@ -145,10 +145,13 @@ def follow(solutions: InverseSolutions, start: ArrayLike, *, explain: bool = Tru
     chosen, reachable, reasons = [], [], []
     for i in range(len(solutions.q)):
         one = replace(
-            solutions, base_T_flange=solutions.base_T_flange[i : i + 1], near=current[None],
-            q=solutions.q[i : i + 1], within_limits=solutions.within_limits[i : i + 1],
+            solutions,
+            base_T_flange=solutions.base_T_flange[i : i + 1],
+            near=current[None],
+            q=solutions.q[i : i + 1],
+            within_limits=solutions.within_limits[i : i + 1],
             excess=solutions.excess[i : i + 1],
-        )  # fmt: skip
+        )
         step = select(one, explain=explain)
         chosen.append(step.q[0])
         reachable.append(bool(step.reachable[0]))
@@ -294,9 +297,16 @@ def carried_arm(chain: Chain) -> tuple[Chain | None, int]:
     if chain.n_joints != 7 or not chain.prismatic[0] or bool(np.any(chain.prismatic[1:])):
         return (chain, 0) if chain.n_joints == 6 else (None, 0)
     arm = Chain(
-        chain.names[1:], chain.prismatic[1:], chain.axes[1:], chain.points[1:], chain.home, chain.frames_home,
-        np.maximum(chain.moved_by - 1, -1), chain.lower[1:], chain.upper[1:],
-    )  # fmt: skip
+        chain.names[1:],
+        chain.prismatic[1:],
+        chain.axes[1:],
+        chain.points[1:],
+        chain.home,
+        chain.frames_home,
+        np.maximum(chain.moved_by - 1, -1),
+        chain.lower[1:],
+        chain.upper[1:],
+    )
     return arm, 1
 
 

@@ -37,9 +37,11 @@ def solve_spherical_wrist(chain: Chain, structure: SphericalWrist, base_T_flange
     wrist = np.stack(columns, axis=-1)
     pointing = np.einsum("nbij,j->nbi", wrist, w[5])
     t4, t5 = two_turns(
-        np.broadcast_to(w[3], pointing.shape), np.broadcast_to(w[4], pointing.shape),
-        np.broadcast_to(w[5], pointing.shape), pointing,
-    )  # fmt: skip
+        np.broadcast_to(w[3], pointing.shape),
+        np.broadcast_to(w[4], pointing.shape),
+        np.broadcast_to(w[5], pointing.shape),
+        pointing,
+    )
     aligned = np.linalg.norm(np.cross(w[3], pointing), axis=-1) < _SINGULAR
     t4 = np.where(aligned[..., None], near[:, None, None, 3], t4)
     kept = rotate(w[3], -t4, np.broadcast_to(pointing[..., None, :], (*t4.shape, 3)))

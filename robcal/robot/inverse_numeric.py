@@ -22,6 +22,7 @@ from robcal.transforms import Array, difference
 BoolArray = NDArray[np.bool_]
 Evaluate = Callable[[Array, NDArray[np.int_]], tuple[Array, Array]]
 
+
 @dataclass(frozen=True)
 class NumericSettings:
     """Settings of the numeric inverse.
@@ -121,9 +122,7 @@ def refine(
     return q, r
 
 
-def search(
-    chain: Chain, base_T_flange: Array, near: Array, settings: NumericSettings, *, all_branches: bool
-) -> Array:
+def search(chain: Chain, base_T_flange: Array, near: Array, settings: NumericSettings, *, all_branches: bool) -> Array:
     """Solutions (n, B, N), padded with NaN.
 
     The start near the given configuration comes first; further starts are spent on rows it does not solve, or on all

@@ -288,8 +288,11 @@ class Kernel:
             self._mapped[key] = (mapped, *mapped.buffer())
         _, buffer, run = self._mapped[key]
         arguments = [
-            np.ascontiguousarray(theta, dtype=float), np.ascontiguousarray(poses.q), np.ascontiguousarray(poses.load),
-            self._covariate_table(poses), np.asfortranarray(self.world_T_base[:3]).ravel(order="F"),
+            np.ascontiguousarray(theta, dtype=float),
+            np.ascontiguousarray(poses.q),
+            np.ascontiguousarray(poses.load),
+            self._covariate_table(poses),
+            np.asfortranarray(self.world_T_base[:3]).ravel(order="F"),
             np.asfortranarray(self.flange_T_tool[:3]).ravel(order="F"),
         ]
         if arguments[0].shape != (len(self.names),):

@@ -99,8 +99,11 @@ def pose_graph(model: RobotModel, statics: str = "one_step", derivatives: bool =
     unknowns = ca.vertcat(theta, q)
     D = ca.jacobian(coordinates, unknowns)
     S = ca.jacobian(coordinates, m)
-    D, S, D_rest = (ca.substitute(D, m, moment), ca.substitute(S, m, moment),
-                    ca.substitute(D, m, ca.SX.zeros(m.shape))) if coupled else (D, S, D)
+    D, S, D_rest = (
+        (ca.substitute(D, m, moment), ca.substitute(S, m, moment), ca.substitute(D, m, ca.SX.zeros(m.shape)))
+        if coupled
+        else (D, S, D)
+    )
     base_six = (at_rest if statics == "one_step" else deflected)[:6]  # those for which the moments were taken
     base_lines = _base_lines(base_six)
     base_R = ca.mtimes(W0[:, :3], local_frame(base_six).R) if world_gravity else ca.SX.eye(3)
@@ -182,8 +185,14 @@ def _gravity(model: RobotModel, theta: ca.SX, index: dict[str, int]) -> tuple[ca
 
 
 def _coordinates(
-    model: RobotModel, theta: ca.SX, q: ca.SX, m: ca.SX, covariates: ca.SX, covariate_names: tuple[str, ...],
-    load_mass: ca.SX, index: dict[str, int],
+    model: RobotModel,
+    theta: ca.SX,
+    q: ca.SX,
+    m: ca.SX,
+    covariates: ca.SX,
+    covariate_names: tuple[str, ...],
+    load_mass: ca.SX,
+    index: dict[str, int],
 ) -> ca.SX:
     """Six coordinates of base, every frame, and tool; the moments enter as symbols."""
     at = {"base": 0, "tool": 6 * (len(model.frames) + 1)} | {f.name: 6 * (i + 1) for i, f in enumerate(model.frames)}

@@ -79,9 +79,7 @@ def calibrated_frames(model: RobotModel) -> tuple[Frame, ...]:
     for f in model.frames:
         d = [model.parameters.get(f"{f.name}.{k}", 0.0) for k in ("x", "y", "z", "roll", "pitch", "yaw")]
         xyz, rpy = np.add(f.xyz, d[:3]), np.add(f.rpy, d[3:])
-        out.append(
-            Frame(f.name, f.axis, f.prismatic, f.sign, f.limits, _triple(xyz), _triple(rpy), f.mass, f.cog)
-        )  # fmt: skip
+        out.append(Frame(f.name, f.axis, f.prismatic, f.sign, f.limits, _triple(xyz), _triple(rpy), f.mass, f.cog))
     return tuple(out)
 
 
@@ -116,9 +114,7 @@ def _frames_of(step: UrdfStep, G: Array, used: set[str]) -> tuple[list[Frame], A
         M = frame(_turn_x_to(line), np.zeros(3))
         rest = invert(M) @ G
         mount = Frame(_free_name(f"{step.name}_mount", used), None, rpy=_triple(rpy_from_rotation(M[:3, :3])))
-        slide = Frame(
-            name, "x", True, 1, step.limits, _triple(rest[:3, 3]), _triple(rpy_from_rotation(rest[:3, :3]))
-        )  # fmt: skip
+        slide = Frame(name, "x", True, 1, step.limits, _triple(rest[:3, 3]), _triple(rpy_from_rotation(rest[:3, :3])))
         return [mount, slide], np.eye(4)
     Q = _turn_x_to(step.axis)
     made = Frame(name, "x", False, 1, step.limits, xyz, _triple(rpy_from_rotation(R @ Q)))
@@ -177,7 +173,7 @@ def _plain(model: RobotModel) -> str:
             low, high = f.limits or (-1e3, 1e3)
             ElementTree.SubElement(
                 joint, "limit", lower=repr(float(low)), upper=repr(float(high)), effort="0", velocity="0"
-            )  # fmt: skip
+            )
         parent = link
     if model.flange_T_tool is not None:
         ElementTree.SubElement(root, "link", name="tool_link")

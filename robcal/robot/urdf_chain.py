@@ -55,9 +55,12 @@ def parse_urdf(text: str) -> Any:
         raise InvalidInput(f"the URDF cannot be read, its XML is broken: {error}") from error
     try:
         urdf = yourdfpy.URDF.load(
-            io.BytesIO(text.encode()), load_meshes=False, load_collision_meshes=False, build_scene_graph=False,
+            io.BytesIO(text.encode()),
+            load_meshes=False,
+            load_collision_meshes=False,
+            build_scene_graph=False,
             build_collision_scene_graph=False,
-        )  # fmt: skip
+        )
     except Exception as error:  # yourdfpy and lxml raise their own kinds without a common base
         raise InvalidInput(f"the URDF cannot be read: {str(error)[:200]}") from error
     return urdf.robot

@@ -24,8 +24,9 @@ def _points(s, sigma: float = 5e-5) -> PointObservations:  # type: ignore[no-unt
     T = s.truth.frames(s.theta, s.poses)
     n = len(T)
     p = T[:, :3, 3] + sigma * s.rng.normal(size=(n, 3))
-    return PointObservations(np.arange(n), np.zeros((n, 3)), p, np.broadcast_to(sigma**2 * np.eye(3), (n, 3, 3)),
-                             np.zeros(n))
+    return PointObservations(
+        np.arange(n), np.zeros((n, 3)), p, np.broadcast_to(sigma**2 * np.eye(3), (n, 3, 3)), np.zeros(n)
+    )
 
 
 def test_exact_data_are_reproduced_to_rounding() -> None:
@@ -107,8 +108,9 @@ def test_mixtures_of_frames_points_distances_and_sensor() -> None:
     seen = tf.transform(tf.invert(T), at_rest) + 5e-5 * s.rng.normal(size=(n, 3))
     sensor = SensorPointObservations(np.arange(n), seen, at_rest, np.broadcast_to(25e-10 * np.eye(3), (n, 3, 3)))
     parts = [frames.subset(np.arange(30)), points.subset(np.arange(30)), distances, sensor]
-    parts[1] = PointObservations(parts[1].pose + 30, parts[1].p_tool, points.p_world[30:60], parts[1].covariance,
-                                 parts[1].target)
+    parts[1] = PointObservations(
+        parts[1].pose + 30, parts[1].p_tool, points.p_world[30:60], parts[1].covariance, parts[1].target
+    )
     robot = identify(s.model, s.poses, parts, kernel=s.kernel)
     assert 0.85 < robot.sigma0 < 1.15
     assert tool_miss(predict_frames(robot, s.kept_out)[0], s.truth.frames(s.theta, s.kept_out)) < 8e-5
@@ -119,8 +121,11 @@ def test_distances_alone() -> None:
     T = s.truth.frames(s.theta, s.poses)
     d = np.linalg.norm(T[:, :3, 3], axis=1) + 5e-5 * s.rng.normal(size=300)
     robot = identify(
-        s.model, s.poses, [DistanceObservations(np.arange(300), d, np.full(300, 5e-5))],
-        IdentifyOptions(parameters="geometry"), s.kernel,
+        s.model,
+        s.poses,
+        [DistanceObservations(np.arange(300), d, np.full(300, 5e-5))],
+        IdentifyOptions(parameters="geometry"),
+        s.kernel,
     )
     assert robot.summary.converged
     assert 0.9 < robot.sigma0 < 1.1
@@ -147,13 +152,17 @@ def test_basis_norm_table_5_4_and_named_parameters() -> None:
     s = scenario(6)
     observed = s.frames(s.poses)
     truth = s.truth.frames(s.theta, s.kept_out)
-    for options in (IdentifyOptions(objective="basis"), IdentifyOptions(parameters="table5.4"),
-                    IdentifyOptions(statics="converged")):
+    for options in (
+        IdentifyOptions(objective="basis"),
+        IdentifyOptions(parameters="table5.4"),
+        IdentifyOptions(statics="converged"),
+    ):
         robot = identify(s.model, s.poses, [observed], options)
         assert tool_miss(predict_frames(robot, s.kept_out)[0], truth) < 5e-4, options
     robot = identify(s.model, s.poses, [observed], IdentifyOptions(parameters=["axis2.pitch"]), s.kernel)
-    assert set(robot.names) - {"axis2.pitch"} == {f"{e}.{k}" for e in ("base", "tool")
-                                                  for k in ("x", "y", "z", "roll", "pitch", "yaw")}
+    assert set(robot.names) - {"axis2.pitch"} == {
+        f"{e}.{k}" for e in ("base", "tool") for k in ("x", "y", "z", "roll", "pitch", "yaw")
+    }
     assert robot.covariance_scale > 10  # far too few parameters: the residuals contradict the stated covariance
 
 
@@ -204,7 +213,5 @@ def test_result_can_be_evaluated_again_from_its_model() -> None:
     s = scenario(10)
     robot = identify(s.model, s.poses, [s.frames(s.poses)], kernel=s.kernel)
     again = Kernel(robot.model)
-    np.testing.assert_allclose(
-        again.frames(again.theta0, s.kept_out), predict_frames(robot, s.kept_out)[0], atol=1e-12
-    )
+    np.testing.assert_allclose(again.frames(again.theta0, s.kept_out), predict_frames(robot, s.kept_out)[0], atol=1e-12)
     assert s.kernel.model.parameters == {}

@@ -35,8 +35,13 @@ def _operators(rng: np.random.Generator, T: np.ndarray) -> list:
         SensorPointObservations(pose, p, world, eye3),
         DistanceObservations(np.arange(n), np.linalg.norm(T[:, :3, 3], axis=1) + 1e-3, np.full(n, 1e-4)),
         PixelObservations(
-            pose, np.zeros(2 * n, dtype=int), p, rng.uniform(0, 1500, (2 * n, 2)),
-            np.broadcast_to(np.eye(2), (2 * n, 2, 2)), (camera,), c_T_w[None],
+            pose,
+            np.zeros(2 * n, dtype=int),
+            p,
+            rng.uniform(0, 1500, (2 * n, 2)),
+            np.broadcast_to(np.eye(2), (2 * n, 2, 2)),
+            (camera,),
+            c_T_w[None],
         ),
     ]
 
@@ -69,8 +74,9 @@ def test_stack_keeps_all_rows_by_pose_and_subset_renumbers() -> None:
     for operator in operators:
         picked = operator.subset([3, 1])
         assert set(picked.pose.tolist()) <= {0, 1}
-        np.testing.assert_array_equal(picked.evaluate(T[[3, 1]])[0][picked.pose == 1],
-                                      operator.evaluate(T)[0][operator.pose == 1])
+        np.testing.assert_array_equal(
+            picked.evaluate(T[[3, 1]])[0][picked.pose == 1], operator.evaluate(T)[0][operator.pose == 1]
+        )
     r, J = operators[0].linearise(T, rng.normal(size=(5, 6, 3)))
     assert r.shape == (30,)
     assert J.shape == (30, 3)

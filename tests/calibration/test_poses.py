@@ -35,16 +35,14 @@ from tests.robot.chains import kr_like
 LIMITS = [(-3.0, 3.0), (-2.4, 0.2), (-2.0, 2.5), (-3.1, 3.1), (-2.1, 2.1), (-3.1, 3.1)]
 MODEL = kr_like()
 MODEL = replace(
-    MODEL,
-    frames=tuple(
-        replace(f, limits=LIMITS[MODEL.joint_of(f.name)]) if f.axis else f for f in MODEL.frames
-    ),
-)  # fmt: skip
+    MODEL, frames=tuple(replace(f, limits=LIMITS[MODEL.joint_of(f.name)]) if f.axis else f for f in MODEL.frames)
+)
 PLATE = Body(
-    "plate", np.arange(5),
+    "plate",
+    np.arange(5),
     np.array([[-0.2, -0.2, 0], [0.2, -0.2, 0], [0.2, 0.2, 0], [-0.2, 0.2, 0], [0, 0, 0.06]]),
     diameters=np.full(5, 0.012),
-)  # fmt: skip
+)
 
 
 def looking_at(eye: tuple[float, float, float], target: tuple[float, float, float]) -> np.ndarray:
@@ -60,9 +58,14 @@ VIEWS = tuple(
     Viewpoint(name, CAMERA, looking_at((4.8, y, 1.6), (1.4, 0, 1.2))) for name, y in (("left", 1.2), ("right", -1.2))
 )
 CELL = Cell(
-    np.eye(4), frame_from_xyzrpy([0, 0, 0.1, 0, 0, 0]), PLATE, VIEWS, VisibilityRules(), link_capsules(MODEL, 0.15),
+    np.eye(4),
+    frame_from_xyzrpy([0, 0, 0.1, 0, 0, 0]),
+    PLATE,
+    VIEWS,
+    VisibilityRules(),
+    link_capsules(MODEL, 0.15),
     (HalfSpace((0, 0, 1), 0.0),),
-)  # fmt: skip
+)
 REQUEST = PoseRequest(MODEL, CELL, count=24, verify=6, candidates=150, payload="dumbbell")
 
 

@@ -19,11 +19,17 @@ def _chain(rng: np.random.Generator) -> RobotModel:
     frames = []
     for i in range(rng.integers(3, 8)):
         axis = "xyz"[rng.integers(3)]
-        frames.append(Frame(
-            f"axis{i + 1}", axis, prismatic=bool(rng.random() < 0.12),
-            xyz=tuple(rng.normal(0, 0.4, 3) * (rng.random(3) < 0.6)),
-            rpy=tuple(rng.choice([0, np.pi / 2, -np.pi / 2, 0.3], 3)), mass=20, cog=(0.1, 0, 0),
-        ))
+        frames.append(
+            Frame(
+                f"axis{i + 1}",
+                axis,
+                prismatic=bool(rng.random() < 0.12),
+                xyz=tuple(rng.normal(0, 0.4, 3) * (rng.random(3) < 0.6)),
+                rpy=tuple(rng.choice([0, np.pi / 2, -np.pi / 2, 0.3], 3)),
+                mass=20,
+                cog=(0.1, 0, 0),
+            )
+        )
     return RobotModel("chain", (*frames, Frame("flange", None, xyz=(0.05, 0, 0.1))))
 
 

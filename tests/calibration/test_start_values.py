@@ -90,7 +90,12 @@ def test_distances_sensor_and_pixels() -> None:
     p_camera = tf.transform(np.stack(looking)[cam], tf.transform(M[pose], body[target]))
     xy = project(camera, p_camera)
     pixels = PixelObservations(
-        pose, cam, body[target], xy, np.broadcast_to(0.01 * np.eye(2), (len(pose), 2, 2)), (camera, camera),
+        pose,
+        cam,
+        body[target],
+        xy,
+        np.broadcast_to(0.01 * np.eye(2), (len(pose), 2, 2)),
+        (camera, camera),
         np.stack(looking),
     )
     for observed in (distance, sensor, pixels):
@@ -104,10 +109,15 @@ def test_distances_sensor_and_pixels() -> None:
 
 def test_scara_whose_turns_share_one_axis() -> None:
     """The rotations alone leave the base's turn open; the translations settle it."""
-    scara = RobotModel("scara", (
-        Frame("a", "z", xyz=(0, 0, 0.3)), Frame("b", "z", xyz=(0.4, 0, 0)),
-        Frame("c", "z", prismatic=True, xyz=(0.3, 0, 0)), Frame("d", "z"),
-    ))
+    scara = RobotModel(
+        "scara",
+        (
+            Frame("a", "z", xyz=(0, 0, 0.3)),
+            Frame("b", "z", xyz=(0.4, 0, 0)),
+            Frame("c", "z", prismatic=True, xyz=(0.3, 0, 0)),
+            Frame("d", "z"),
+        ),
+    )
     rng = np.random.default_rng(0)
     kernel = Kernel(scara)
     poses = kernel.poses(rng.uniform([-2, -2, -0.2, -3], [2, 2, 0.0, 3], (30, 4)))

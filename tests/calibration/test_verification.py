@@ -36,8 +36,9 @@ def test_kept_out_poses_agree_with_the_stated_uncertainty() -> None:
 
 def test_a_model_that_lacks_physics_is_not_honest() -> None:
     s = scenario(1)
-    robot = identify(s.model, s.poses, [s.frames(s.poses)],
-                     IdentifyOptions(parameters="geometry", covariance="stated"), s.kernel)
+    robot = identify(
+        s.model, s.poses, [s.frames(s.poses)], IdentifyOptions(parameters="geometry", covariance="stated"), s.kernel
+    )
     result = verify(robot, s.kept_out, [s.frames(s.kept_out)])
     assert result.p_value < 1e-6
     assert result.coverage_95 < 0.6
@@ -65,8 +66,9 @@ def test_points_alone_and_empty_statistics() -> None:
     s = scenario(3)
     T = s.truth.frames(s.theta, s.kept_out)
     p = T[:, :3, 3] + [1e-3, 0, 0]
-    points = PointObservations(np.arange(200), np.zeros((200, 3)), p, np.broadcast_to(np.eye(3), (200, 3, 3)),
-                               np.zeros(200))
+    points = PointObservations(
+        np.arange(200), np.zeros((200, 3)), p, np.broadcast_to(np.eye(3), (200, 3, 3)), np.zeros(200)
+    )
     ((_, errors),) = tool_errors(T, [points]).values()
     np.testing.assert_allclose(errors, 1e-3)
     assert np.isnan(ErrorStatistics.of([]).mean)

@@ -21,9 +21,11 @@ from robcal.transforms import frame_from_xyzrpy, invert, retract, transform
 
 CAMERA = Camera(2000, 1500, 3000.0, 3000.0, 999.5, 749.5, k1=-0.1)
 PLATE = Body(
-    "plate", np.arange(5), np.array([[-0.2, -0.2, 0], [0.2, -0.2, 0], [0.2, 0.2, 0], [-0.2, 0.2, 0], [0, 0, 0]]),
+    "plate",
+    np.arange(5),
+    np.array([[-0.2, -0.2, 0], [0.2, -0.2, 0], [0.2, 0.2, 0], [-0.2, 0.2, 0], [0, 0, 0]]),
     diameters=np.full(5, 0.012),
-)  # fmt: skip
+)
 RULES = VisibilityRules(cameras=1)
 FRONT = Viewpoint("front", CAMERA, np.eye(4))
 

@@ -84,8 +84,14 @@ def _scored(
 def test_right_answer(plan: Plan, recorded: tuple[Recording, Truth]) -> None:
     truth = recorded[1]
     rivals = [{"cause": "backlash", "where": "axis1", "direction": "z"}]
-    told = _cause("hysteresis", "axis1", "z", parameters={"width_deg": 0.021}, sigma={"width_deg": 0.001},
-                  indistinguishable_from=rivals)  # fmt: skip
+    told = _cause(
+        "hysteresis",
+        "axis1",
+        "z",
+        parameters={"width_deg": 0.021},
+        sigma={"width_deg": 0.001},
+        indistinguishable_from=rivals,
+    )
     result = _scored(plan, recorded, [told], inside=truth.inside.with_effect)
     assert result["name_right"]
     assert result["exact"]
@@ -113,8 +119,9 @@ def test_wrong_answers(plan: Plan, recorded: tuple[Recording, Truth]) -> None:
 def test_tables_are_made_of_any_mixture_of_records(plan: Plan, recorded: tuple[Recording, Truth]) -> None:
     head = {"key": "k", "battery": "singles", "label": "hysteresis", "level": "points", "snr": 12.0, "seed": 3}
     right = _scored(plan, recorded, [_cause("hysteresis", "axis1", "z")], inside=recorded[1].inside.with_effect)
-    text = report([{**head, **right}, {**head, **_scored(plan, recorded, [])}, {**head, "error": "no"},
-                   {**head, "skipped": "no"}])  # fmt: skip
+    text = report(
+        [{**head, **right}, {**head, **_scored(plan, recorded, [])}, {**head, "error": "no"}, {**head, "skipped": "no"}]
+    )
     assert "50.0 % (1/2)" in text
     assert "1 runs failed" in text
 

@@ -100,9 +100,16 @@ def test_what_is_fitted_anyway_is_told_as_fitted_last(tmp_path: Path) -> None:
 def test_torque_that_acts_through_a_compliance_is_told_for_the_compliance_of_the_end() -> None:
     law, end, torque = 4e-6, 2e-6, np.array([30.0, 40.0])
     family = Family(
-        "counterbalance", "robot", "axis2", "y", ("cosine", "sine"), (1.0, 1.0), lambda v, c: {}, "",
+        "counterbalance",
+        "robot",
+        "axis2",
+        "y",
+        ("cosine", "sine"),
+        (1.0, 1.0),
+        lambda v, c: {},
+        "",
         through=("axis2.elastic_pitch", law),
-    )  # fmt: skip
+    )
     item = Accepted(family, {}, torque, np.zeros((2, 2)))
     names = ("axis2.elastic_pitch", "axis2_counterbalance_0.cosine", "axis2_counterbalance_0.sine")
     covariance = np.diag([(0.1 * end) ** 2, 0.0, 0.0])

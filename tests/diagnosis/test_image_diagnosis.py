@@ -81,9 +81,13 @@ def test_body_less_accurate_than_stated_is_no_crowd_of_shifted_targets():
     scene = station(seed=8)
     rng = np.random.default_rng(1)
     wrong = Body(
-        "plate", scene.given.ids, scene.given.points + 2e-5 * rng.standard_normal(scene.given.points.shape),
-        scene.given.covariance, scene.given.codes, scene.given.diameters,
-    )  # fmt: skip
+        "plate",
+        scene.given.ids,
+        scene.given.points + 2e-5 * rng.standard_normal(scene.given.points.shape),
+        scene.given.covariance,
+        scene.given.codes,
+        scene.given.diameters,
+    )
     data = station_data(scene.orientation, scene.names, wrong, dict.fromkeys(scene.orientation.names))
     assert not [f for f in diagnose_images(data).findings if f.cause == "target_shifted"]
 

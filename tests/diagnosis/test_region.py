@@ -25,9 +25,13 @@ def test_the_outermost_poses_lie_at_the_longer_end() -> None:
 def test_what_was_left_out_shows_outside_the_range(tmp_path: Path) -> None:
     found, identify, _, _ = concealed(tmp_path, seed=4, effects=["joint_eccentricity"], snr=25.0)
     result = diagnose(
-        found.model, identify, found.names, (*found.eliminated, *own_elasticities(found)), None,
+        found.model,
+        identify,
+        found.names,
+        (*found.eliminated, *own_elasticities(found)),
+        None,
         optional=optional_parameters(found),
-    )  # fmt: skip
+    )
     assert result.mismatch
     assert result.region is not None
     before, after = result.region

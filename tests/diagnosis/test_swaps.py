@@ -19,7 +19,10 @@ def recording(order: list[int], sigma: float = 5e-5) -> Recording:
     world = transform(frames[:, None], BODY[None]) + rng.normal(0, sigma, (12, 5, 3))
     pose = np.repeat(np.arange(12), 5)
     obs = PointObservations(
-        pose, np.tile(BODY[order], (12, 1)), world.reshape(-1, 3), np.tile(sigma**2 * np.eye(3), (60, 1, 1)),
+        pose,
+        np.tile(BODY[order], (12, 1)),
+        world.reshape(-1, 3),
+        np.tile(sigma**2 * np.eye(3), (60, 1, 1)),
         np.tile(IDS[order], 12),
     )
     return Recording(np.zeros((12, 6)), (None,) * 12, {"index": np.arange(12.0)}, tuple("abcdefghijkl"), obs)

@@ -63,9 +63,14 @@ def render(
 
 
 def expose(
-    light: Array, rng: np.random.Generator, contrast: float = 180.0, background: float = 15.0, read_noise: float = 1.0,
-    gain: float = 0.05, bits: int = 8,
-) -> NDArray:  # fmt: skip
+    light: Array,
+    rng: np.random.Generator,
+    contrast: float = 180.0,
+    background: float = 15.0,
+    read_noise: float = 1.0,
+    gain: float = 0.05,
+    bits: int = 8,
+) -> NDArray:
     """Grey values with read noise (grey values) and shot noise (variance = gain * value), quantised and clipped."""
     value = background + contrast * light
     value = value + rng.normal(size=value.shape) * np.sqrt(read_noise**2 + gain * value)
@@ -73,8 +78,15 @@ def expose(
     return np.clip(np.rint(value), 0, top).astype(np.uint8 if bits == 8 else np.uint16)
 
 
-def scene(rng: np.random.Generator, width: int, height: int, count: int, size: tuple[float, float], codes: list[int],
-          spacing: float) -> list[Dot]:  # fmt: skip
+def scene(
+    rng: np.random.Generator,
+    width: int,
+    height: int,
+    count: int,
+    size: tuple[float, float],
+    codes: list[int],
+    spacing: float,
+) -> list[Dot]:
     """Dots at random places with random size, tilt and turn, at least `spacing` major axes apart."""
     dots: list[Dot] = []
     for _ in range(50 * count):

@@ -24,10 +24,16 @@ def field(rng: np.random.Generator, a: float, ratio: float, side: int = 9) -> tu
     """Dots on a grid with random sub-pixel place and turn, and the image's side."""
     pitch = int(3 * a + 14)
     dots = [
-        Dot(pitch * (i + 0.7) + rng.uniform(-0.5, 0.5), pitch * (j + 0.7) + rng.uniform(-0.5, 0.5), a, a * ratio,
-            rng.uniform(0, np.pi))
-        for i in range(side) for j in range(side)
-    ]  # fmt: skip
+        Dot(
+            pitch * (i + 0.7) + rng.uniform(-0.5, 0.5),
+            pitch * (j + 0.7) + rng.uniform(-0.5, 0.5),
+            a,
+            a * ratio,
+            rng.uniform(0, np.pi),
+        )
+        for i in range(side)
+        for j in range(side)
+    ]
     return dots, pitch * (side + 1)
 
 

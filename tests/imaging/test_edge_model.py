@@ -57,9 +57,10 @@ def test_axes_and_matrix_are_inverse(major: float, ratio: float, angle: float) -
 def test_profile_agrees_with_area_integration(a: float, b: float) -> None:
     blur = 0.7
     light = render(31, 31, [Dot(15.3, 14.8, a, b, 0.4)], blur, sub=16)
-    shape = np.concatenate([
-        [[15.3, 14.8]], matrix_from_axes(np.array([[a, b]]), np.array([0.4])), [[np.log(np.sqrt(blur**2 + 1 / 12))]]
-    ], axis=1)  # fmt: skip
+    shape = np.concatenate(
+        [[[15.3, 14.8]], matrix_from_axes(np.array([[a, b]]), np.array([0.4])), [[np.log(np.sqrt(blur**2 + 1 / 12))]]],
+        axis=1,
+    )
     x, y = pixels(1, 15)
     model = blurred_ellipse(shape, x, y)[0].reshape(31, 31)
     # the edge of a blurred disc recedes by s^2 / 2R, which a fit takes up in the radius

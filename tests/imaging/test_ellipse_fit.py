@@ -12,9 +12,13 @@ from tests.imaging.rendering import Dot, expose, render
 def one_dot(saturation: float = np.inf):
     image = expose(render(40, 40, [Dot(20.2, 19.6, 6, 5, 0.4)]), np.random.default_rng(1))
     candidates = Candidates(
-        np.array([[20.0, 20.0]]), np.array([[6.0, 5.0]]), np.array([0.4]), np.array([15.0]), np.array([195.0]),
+        np.array([[20.0, 20.0]]),
+        np.array([[6.0, 5.0]]),
+        np.array([0.4]),
+        np.array([15.0]),
+        np.array([195.0]),
         np.array([0.7]),
-    )  # fmt: skip
+    )
     return image, gather_windows(image, candidates, saturation)[0]
 
 
@@ -60,9 +64,13 @@ def test_saturated_pixels_only_say_at_least() -> None:
     image, window = one_dot(saturation=120.0)
     clipped = np.minimum(image, 120)
     candidates = Candidates(
-        np.array([[20.0, 20.0]]), np.array([[6.3, 5.3]]), np.array([0.4]), np.array([15.0]), np.array([120.0]),
+        np.array([[20.0, 20.0]]),
+        np.array([[6.3, 5.3]]),
+        np.array([0.4]),
+        np.array([15.0]),
+        np.array([120.0]),
         np.array([0.7]),
-    )  # fmt: skip
+    )
     window = gather_windows(clipped, candidates, 120.0)[0]
     shape = from_origin(window, [20.0, 20.0, 0.17, 0.0, 0.19, np.log(0.8)])
     noise = NoiseModel(2.0, 0.0, 15.0)

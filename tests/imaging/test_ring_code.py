@@ -35,11 +35,16 @@ def grid(rng: np.random.Generator, size: float, tilt: float, count: int = 16) ->
     side = int(np.ceil(np.sqrt(count)))
     return [
         Dot(
-            pitch * (k % side + 0.6) + rng.uniform(-0.5, 0.5), pitch * (k // side + 0.6) + rng.uniform(-0.5, 0.5),
-            size, size * tilt, rng.uniform(0, np.pi), int(ids[k]), rng.uniform(0, 2 * np.pi),
+            pitch * (k % side + 0.6) + rng.uniform(-0.5, 0.5),
+            pitch * (k // side + 0.6) + rng.uniform(-0.5, 0.5),
+            size,
+            size * tilt,
+            rng.uniform(0, np.pi),
+            int(ids[k]),
+            rng.uniform(0, 2 * np.pi),
         )
         for k in range(count)
-    ]  # fmt: skip
+    ]
 
 
 def readings(image: np.ndarray, dots: list[Dot], **more) -> tuple[int, int]:

@@ -90,9 +90,13 @@ def simulate(
         noisy = xy[inside] + rng.normal(size=(len(pose), 2)) * sigma
         marks[name] = StationMarks(pose, body.ids[target], noisy, np.tile(np.eye(2) * sigma**2, (len(pose), 1, 1)))
     return Station(
-        body, points, dict(zip(names, lenses, strict=True)),
-        {n: first @ f for n, f in zip(names, frames, strict=True)}, world_T_body, marks,
-    )  # fmt: skip
+        body,
+        points,
+        dict(zip(names, lenses, strict=True)),
+        {n: first @ f for n, f in zip(names, frames, strict=True)},
+        world_T_body,
+        marks,
+    )
 
 
 def nees(error: Array, covariance: Array) -> Array:

@@ -104,9 +104,13 @@ def test_the_minimum_is_that_of_an_independent_solver() -> None:
     free = ("fx", "fy", "cx", "cy", "k1")
     start = truth.camera.with_vector([*truth.camera.vector[:5], 0.08, 2e-4, -3e-4, -0.01])
     net = adjust(
-        truth.marks, start, truth.camera_T_body, truth.points, free_intrinsics=free,
+        truth.marks,
+        start,
+        truth.camera_T_body,
+        truth.points,
+        free_intrinsics=free,
         settings=AdjustSettings(snooping=False, robust=False),
-    )  # fmt: skip
+    )
     basis = intrinsics_basis(free)
     state = State(start, truth.camera_T_body, truth.points)
 
@@ -134,9 +138,13 @@ def test_estimated_uncertainty_is_the_true_one(body: str) -> None:
         marks = replace(truth.marks, xy=exact + rng.normal(0, truth.sigma, exact.shape))
         lengths = replace(bar, length=bar.length + rng.normal(0, bar.sigma))
         net = adjust(
-            marks, truth.camera, truth.camera_T_body, truth.points, lengths=lengths,
+            marks,
+            truth.camera,
+            truth.camera_T_body,
+            truth.points,
+            lengths=lengths,
             settings=AdjustSettings(robust=False, snooping=False),
-        )  # fmt: skip
+        )
         e = aligned_error(net.points, truth.points[net.ids], scale=False).ravel()
         points += e @ np.linalg.pinv(net.points_covariance, rcond=1e-10, hermitian=True) @ e / (e.size - 6)
         d = net.camera.vector - truth.camera.vector
@@ -312,9 +320,8 @@ def test_undetermined_distortion_is_left_out_and_said() -> None:
     assert net.intrinsics_covariance[INTRINSIC_NAMES.index("k3")].max() == 0.0
     with pytest.raises(NotIdentifiable, match="k3"):
         adjust(
-            truth.marks, truth.camera, truth.camera_T_body, truth.points,
-            settings=AdjustSettings(undetermined="raise"),
-        )  # fmt: skip
+            truth.marks, truth.camera, truth.camera_T_body, truth.points, settings=AdjustSettings(undetermined="raise")
+        )
 
 
 def test_contradictory_scale_bars_are_named() -> None:
@@ -375,9 +382,11 @@ def test_a_target_marked_twice_and_lonely_marks_are_left_out() -> None:
     marks = truth.marks.select(keep)
     double = marks.select([3])
     marks = ImageMarks(
-        np.append(marks.image, double.image), np.append(marks.target, double.target),
-        np.vstack([marks.xy, double.xy + 5.0]), np.concatenate([marks.covariance, double.covariance]),
-    )  # fmt: skip
+        np.append(marks.image, double.image),
+        np.append(marks.target, double.target),
+        np.vstack([marks.xy, double.xy + 5.0]),
+        np.concatenate([marks.covariance, double.covariance]),
+    )
     net = adjust(marks, *near(truth, rng))
     reasons = {(r.image, r.target): r.reason for r in net.rejected}
     assert "more than once" in reasons[(str(double.image[0]), int(double.target[0]))]
@@ -390,9 +399,15 @@ def test_a_start_far_away_still_converges_with_damping() -> None:
     truth = make_network(rng, images=12, targets=20)
     c = truth.camera
     problem = Problem(
-        MarkOrder(truth.marks, 12, 20), intrinsics_basis(INTRINSIC_NAMES), Datum("inner", np.arange(20), True, ""),
-        Bars.none(), np.zeros(20), None, np.zeros(len(truth.marks), int), np.ones(1),
-    )  # fmt: skip
+        MarkOrder(truth.marks, 12, 20),
+        intrinsics_basis(INTRINSIC_NAMES),
+        Datum("inner", np.arange(20), True, ""),
+        Bars.none(),
+        np.zeros(20),
+        None,
+        np.zeros(len(truth.marks), int),
+        np.ones(1),
+    )
     camera = Camera(c.width, c.height, 0.75 * c.fx, 0.75 * c.fx, (c.width - 1) / 2, (c.height - 1) / 2)
     poses = retract(truth.camera_T_body, rng.normal(0, 0.05, (12, 6)))
     state, summary = minimise(problem, State(camera, poses, truth.points + rng.normal(0, 0.03, (20, 3))))

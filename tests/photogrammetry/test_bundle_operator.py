@@ -22,9 +22,7 @@ QUIET = AdjustSettings(robust=False, snooping=False, variance_components=False)
 def network(distortion: tuple[float, ...], seed: int = 0) -> CameraNetwork:
     truth = make_network(np.random.default_rng(seed), images=12, targets=20, distortion=distortion)
     start = truth.camera.with_vector([*truth.camera.vector[:4], 0, 0, 0, 0, 0])
-    return adjust(
-        truth.marks, start, truth.camera_T_body, truth.points, free_intrinsics=PINHOLE, settings=QUIET
-    )  # fmt: skip
+    return adjust(truth.marks, start, truth.camera_T_body, truth.points, free_intrinsics=PINHOLE, settings=QUIET)
 
 
 def lens_columns(net: CameraNetwork) -> np.ndarray:

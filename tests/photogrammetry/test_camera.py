@@ -21,8 +21,19 @@ def some_camera(rng: np.random.Generator, factor: float) -> Camera:
     k1, k2, k3 = rng.uniform(-0.1, 0.1, 3) / [reach2, reach2**2, reach2**3]
     p1, p2 = rng.uniform(-2e-3, 2e-3, 2)
     f = factor * 2000
-    return Camera(2000, 1500, f, f * rng.uniform(0.98, 1.02), 1000 + rng.normal(0, 20), 750 + rng.normal(0, 20),
-                  k1, k2, p1, p2, k3)  # fmt: skip
+    return Camera(
+        2000,
+        1500,
+        f,
+        f * rng.uniform(0.98, 1.02),
+        1000 + rng.normal(0, 20),
+        750 + rng.normal(0, 20),
+        k1,
+        k2,
+        p1,
+        p2,
+        k3,
+    )
 
 
 def some_points(rng: np.random.Generator, camera: Camera, shape: tuple[int, ...]) -> np.ndarray:

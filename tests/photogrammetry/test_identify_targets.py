@@ -29,10 +29,13 @@ def _detections(body, camera, camera_T_body, coded, rng, distractors):
     code = np.r_[np.where(coded, body.ids, -1), -np.ones(distractors, dtype=int)]
     order = rng.permutation(len(xy))
     d = SimpleNamespace(
-        shape=(2048, 2448), xy=xy[order], covariance=np.tile(np.eye(2) * 4e-4, (len(xy), 1, 1)),
-        semi_axes=np.column_stack([size, 0.8 * size])[order], code=code[order],
+        shape=(2048, 2448),
+        xy=xy[order],
+        covariance=np.tile(np.eye(2) * 4e-4, (len(xy), 1, 1)),
+        semi_axes=np.column_stack([size, 0.8 * size])[order],
+        code=code[order],
         kind=np.where(code[order] >= 0, TargetKind.RING12, TargetKind.DOT),
-    )  # fmt: skip
+    )
     return d, truth[order]
 
 

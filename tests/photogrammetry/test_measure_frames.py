@@ -133,9 +133,7 @@ def test_degenerate_bodies_and_poses():
         measure_frames(_points(points=line.points)[1], line)
     _, points = _points()
     keep = (points.pose != 4) | np.isin(points.target, [11, 22])
-    f = measure_frames(
-        MeasuredPoints.from_table(points.pose[keep], points.target[keep], points.p_world[keep]), BODY
-    )
+    f = measure_frames(MeasuredPoints.from_table(points.pose[keep], points.target[keep], points.p_world[keep]), BODY)
     assert [r.pose for r in f.rejected_poses] == [4]
     with pytest.raises(InvalidInput, match="above zero"):
         measure_frames(points, BODY, tolerance=0.0)

@@ -83,9 +83,13 @@ def test_many_images_agree_with_one_by_one():
     parts = [_image(rng, tilt=(0.5, 0.1 * k, 0.2)) for k in range(4)]
     image = np.repeat(np.arange(4), 5)
     many = resect_images(
-        CAMERA, image, np.tile(BODY.ids, 4), np.concatenate([p[1] for p in parts]),
-        np.concatenate([p[2] for p in parts]), BODY,
-    )  # fmt: skip
+        CAMERA,
+        image,
+        np.tile(BODY.ids, 4),
+        np.concatenate([p[1] for p in parts]),
+        np.concatenate([p[2] for p in parts]),
+        BODY,
+    )
     for result, (_, xy, C) in zip(many, parts, strict=True):
         assert isinstance(result, Resection)
         assert np.allclose(result.camera_T_body, resect(CAMERA, BODY.ids, xy, C, BODY).camera_T_body, atol=1e-7)

@@ -155,9 +155,11 @@ def test_bad_input_is_named():
         replace(s.marks["left"], xy=xy)
     double = s.marks["left"]
     twice = StationMarks(
-        np.r_[double.pose, double.pose[:1]], np.r_[double.target, double.target[:1]],
-        np.r_[double.xy, double.xy[:1]], np.r_[double.covariance, double.covariance[:1]],
-    )  # fmt: skip
+        np.r_[double.pose, double.pose[:1]],
+        np.r_[double.target, double.target[:1]],
+        np.r_[double.xy, double.xy[:1]],
+        np.r_[double.covariance, double.covariance[:1]],
+    )
     with pytest.raises(InvalidInput, match="more than once"):
         orient_station({"left": twice}, s.body, s.rough, {"left": SIZE})
 

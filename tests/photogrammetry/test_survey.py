@@ -225,9 +225,14 @@ def test_useless_images_are_left_out_with_their_reason() -> None:
 
     black = SimpleNamespace(**{**vars(part(0)), "message": "the image is black"})
     noise = SimpleNamespace(
-        xy=rng.uniform(50, 1700, (18, 2)), covariance=np.tile(np.eye(2) * 0.01, (18, 1, 1)),
-        semi_axes=np.full((18, 2), 8.0), angle=np.zeros(18), kind=np.zeros(18), code=np.arange(100, 118), message="",
-    )  # fmt: skip
+        xy=rng.uniform(50, 1700, (18, 2)),
+        covariance=np.tile(np.eye(2) * 0.01, (18, 1, 1)),
+        semi_axes=np.full((18, 2), 8.0),
+        angle=np.zeros(18),
+        kind=np.zeros(18),
+        code=np.arange(100, 118),
+        message="",
+    )
     extra = [
         SurveyImage("copy.png", images[3].detections),
         SurveyImage("few.png", part(2)),  # type: ignore[arg-type]

@@ -41,9 +41,11 @@ def test_two_dots_within_the_gate_are_left_out() -> None:
     truth, geometry, sightings = scene()
     rival = sightings.xy[:1] + 0.3
     more = Sightings(
-        np.append(sightings.image, sightings.image[0]), np.vstack([sightings.xy, rival]),
-        np.append(sightings.sigma, truth.sigma), np.append(sightings.size, 8.0),
-    )  # fmt: skip
+        np.append(sightings.image, sightings.image[0]),
+        np.vstack([sightings.xy, rival]),
+        np.append(sightings.sigma, truth.sigma),
+        np.append(sightings.size, 8.0),
+    )
     found = match_known(geometry, more, np.full(len(more.image), -1), np.full((20, 3), np.nan), 10.0)
     assert found[0] == -1
     assert found[-1] == -1
@@ -69,7 +71,7 @@ def test_new_points_are_where_they_are() -> None:
     known = truth.marks.target < 6
     found = find_new_points(
         geometry, sightings, np.where(known, truth.marks.target, -1), centre=np.zeros(3), radius=1.0
-    )  # fmt: skip
+    )
     assert len(found.points) == 14
     for point, C, members in zip(found.points, found.covariance, found.members, strict=True):
         target = truth.marks.target[members]

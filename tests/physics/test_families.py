@@ -17,11 +17,28 @@ from robcal.robot.model import Frame, Payload, RobotModel
 from robcal.robot.terms import evaluate
 
 ROBOT_CAUSES = {
-    "stiffness_nonlinear", "backlash", "hysteresis", "lost_motion", "zero_jump", "joint_eccentricity", "gear_ripple",
-    "transmission_ratio", "joint_coupling", "axis_wobble", "counterbalance", "payload_mass", "payload_cog",
-    "base_compliance", "base_tilt", "thermal_growth", "thermal_zero_drift", "base_moved", "link_compliance", "geometry",
+    "stiffness_nonlinear",
+    "backlash",
+    "hysteresis",
+    "lost_motion",
+    "zero_jump",
+    "joint_eccentricity",
+    "gear_ripple",
+    "transmission_ratio",
+    "joint_coupling",
+    "axis_wobble",
+    "counterbalance",
+    "payload_mass",
+    "payload_cog",
+    "base_compliance",
+    "base_tilt",
+    "thermal_growth",
+    "thermal_zero_drift",
+    "base_moved",
+    "link_compliance",
+    "geometry",
     "joint_compliance",
-}  # fmt: skip
+}
 
 
 def site(fitted: frozenset[str] = frozenset({"axis1.elastic_yaw", "axis2.elastic_pitch"})) -> RobotSite:

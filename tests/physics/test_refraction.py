@@ -17,9 +17,15 @@ AXES = "xyz"
 def data(points: np.ndarray) -> ObservationData:
     m = len(points)
     return ObservationData(
-        "points", np.arange(m), np.arange(m) % 5, np.tile(np.eye(4), (m, 1, 1)), np.zeros((m, 3)), points, None,
+        "points",
+        np.arange(m),
+        np.arange(m) % 5,
+        np.tile(np.eye(4), (m, 1, 1)),
+        np.zeros((m, 3)),
+        points,
+        None,
         {"index": np.arange(m, dtype=float)},
-    )  # fmt: skip
+    )
 
 
 def bend_from(points: np.ndarray, viewpoint: np.ndarray, up: np.ndarray) -> np.ndarray:

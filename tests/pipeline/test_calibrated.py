@@ -16,8 +16,11 @@ UR10 = Path(__file__).parents[2] / "configs" / "robots" / "ur10.yaml"
 
 def test_folding_the_cell_moves_nothing() -> None:
     rng = np.random.default_rng(2)
-    deviations = {f"{end}.{k}": float(v) for end in ("base", "tool") for k, v in zip(
-        ("x", "y", "z", "roll", "pitch", "yaw"), rng.normal(0, 1e-2, 6), strict=True)}  # fmt: skip
+    deviations = {
+        f"{end}.{k}": float(v)
+        for end in ("base", "tool")
+        for k, v in zip(("x", "y", "z", "roll", "pitch", "yaw"), rng.normal(0, 1e-2, 6), strict=True)
+    }
     ends = frame_from_xyzrpy(rng.normal(size=(2, 6)))
     model = replace(
         read_robot(UR10), parameters={"axis2.x": 1e-3, **deviations}, world_T_base=ends[0], flange_T_tool=ends[1]
@@ -33,8 +36,9 @@ def test_folding_the_cell_moves_nothing() -> None:
 def test_joint_scatter_is_part_of_what_a_prediction_may_miss() -> None:
     model = replace(read_robot(UR10), world_T_base=np.eye(4), flange_T_tool=np.eye(4))
     q = np.random.default_rng(3).uniform(-1, 1, (4, 6))
-    poses = Poses(Path("poses.csv"), ("a", "b", "c", "d"), np.arange(4), q, (None,) * 4, np.zeros(4, dtype=bool),
-                  np.zeros((4, 6)))  # fmt: skip
+    poses = Poses(
+        Path("poses.csv"), ("a", "b", "c", "d"), np.arange(4), q, (None,) * 4, np.zeros(4, dtype=bool), np.zeros((4, 6))
+    )
     kernel = Kernel(model)
     calibrated = Calibrated(model, model, "one_step", (), np.zeros((0, 0)), q, np.tile(np.eye(4), (4, 1, 1)))
     T, without = predicted(calibrated, poses)

@@ -62,8 +62,10 @@ def test_compiled_forward_model_says_what_predict_says(finished: tuple[Path, Pat
     assert covariates is not None
     names = covariates[1].split(", ")
     assert set(names) == {"approach2", "temp_arm_c"}
-    loads = {name: [float(v) for v in re.findall(r"[-+.\de]+", text)]
-             for name, text in re.findall(r"_payload_(\w+) (\{.*)", header)}
+    loads = {
+        name: [float(v) for v in re.findall(r"[-+.\de]+", text)]
+        for name, text in re.findall(r"_payload_(\w+) (\{.*)", header)
+    }
     predict_run(run, campaign / "poses.csv", tmp_path / "predicted.csv")
     table = read_table(tmp_path / "predicted.csv")
     expected = np.column_stack([table.numbers(f"{n}_mm") for n in "xyz"])

@@ -177,7 +177,7 @@ ALIASES = b"".join(b"%c: &%c [*%c, *%c]\n" % (k + 1, k + 1, k, k) for k in range
         (replaced(b"pose,target,x_mm,y_mm,z_mm\n" + b"p001,17,1_000,2,3\n"), "'1_000', not a number"),
         (replaced(b"pose,target,x_mm,y_mm,z_mm\n" + b"p001,17,1e999,2,3\n"), "x_mm is"),
     ],
-)  # fmt: skip
+)
 def test_tables_that_cannot_be_meant(
     point_campaign: Path, tmp_path: Path, spoil: Callable[[Path], None], words: str
 ) -> None:
@@ -295,7 +295,7 @@ def test_files_of_operating_systems_beside_the_images(image_campaign: Path, dete
         (b"[" * 5000, "not valid YAML"),
         ("format: robcal/campaign-1\nname: Zellä\n".encode("latin-1"), "line 2: not UTF-8"),
     ],
-)  # fmt: skip
+)
 def test_hostile_campaign_files(tmp_path: Path, content: bytes, words: str) -> None:
     (tmp_path / "campaign.yaml").write_bytes(content)
     told = refused(tmp_path, tmp_path / "run")

@@ -64,8 +64,10 @@ def exchanged_beyond_limits(rows: Rows) -> None:
 
 @pytest.mark.parametrize(
     ("fault", "words"),
-    [(wrong_sign_beyond_limits, "joint 2 (axis2) is counted with the wrong sign"),
-     (exchanged_beyond_limits, "the columns of joints 1 and 2 are exchanged")],
+    [
+        (wrong_sign_beyond_limits, "joint 2 (axis2) is counted with the wrong sign"),
+        (exchanged_beyond_limits, "the columns of joints 1 and 2 are exchanged"),
+    ],
 )
 def test_a_slip_that_leaves_the_ranges_is_named_as_well(
     frame_campaign: Path, tmp_path: Path, fault, words: str

@@ -22,9 +22,8 @@ RADIUS = 0.2
 @pytest.mark.slow
 def test_sphere_is_surveyed_from_images(tmp_path: Path) -> None:
     plan = full_campaign(
-        seed=3, survey_images=30, identify=0, verify=0, sphere=True, width=1280, height=1024, focal_mm=8.0,
-        pixel_um=4.8,
-    )  # fmt: skip
+        seed=3, survey_images=30, identify=0, verify=0, sphere=True, width=1280, height=1024, focal_mm=8.0, pixel_um=4.8
+    )
     body = target_sphere(radius=RADIUS, coded=48, dots=60, diameter=0.008, seed=3)
     survey = replace(next(s for s in plan.surveys if s.name == "sphere"), body=body, bar_sigma=1e-6)
     campaign = write_image_campaign(replace(plan, surveys=(survey,)), tmp_path / "campaign", tmp_path / "truth")

@@ -91,9 +91,7 @@ def test_commands_agree_with_python(name, tmp_path):
         answers = [bot.command(kind, wanted[k], conditions, q[k]) for k in range(len(q))]
         assert [status for status, _ in answers] == [0] * len(q)
         commanded = np.array([values for _, values in answers])
-        there, here = (
-            kernel.frames(kernel.theta0, kernel.poses(values, "load")) for values in (expected.q, commanded)
-        )
+        there, here = (kernel.frames(kernel.theta0, kernel.poses(values, "load")) for values in (expected.q, commanded))
         assert np.abs(difference(there, here)).max() < 1e-9
         assert commanded == pytest.approx(expected.q, abs=3e-8)
 

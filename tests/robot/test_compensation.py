@@ -109,9 +109,7 @@ def test_error_of_one_step_is_second_order():
         model = real_robot("ur10", rng, scale)
         q = regular_poses(model, 40, rng)
         W, L = cell_frames(Kernel(model))
-        answer = compensate(
-            model, W @ forward(chain_of(model), q) @ L, payload="load", near=q, settings=ONE_STEP
-        )  # fmt: skip
+        answer = compensate(model, W @ forward(chain_of(model), q) @ L, payload="load", near=q, settings=ONE_STEP)
         position.append(np.median(np.linalg.norm(answer.remaining[:, :3], axis=1)))
     assert 30 < position[0] / position[1] < 300
 

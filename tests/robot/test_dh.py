@@ -42,9 +42,13 @@ def test_chain_moves_as_the_table_says(convention, table, seed):
 def test_ur10_table_reaches_the_published_zero_position():
     half = np.pi / 2
     table = [
-        DHRow(d=0.1273, alpha=half), DHRow(a=-0.612), DHRow(a=-0.5723), DHRow(d=0.163941, alpha=half),
-        DHRow(d=0.1157, alpha=-half), DHRow(d=0.0922),
-    ]  # fmt: skip
+        DHRow(d=0.1273, alpha=half),
+        DHRow(a=-0.612),
+        DHRow(a=-0.5723),
+        DHRow(d=0.163941, alpha=half),
+        DHRow(d=0.1157, alpha=-half),
+        DHRow(d=0.0922),
+    ]
     T = forward(chain_of(RobotModel("ur10", frames_from_dh(table))), np.zeros(6))[0]
     assert T[:3, 3] == pytest.approx([-0.612 - 0.5723, -0.163941 - 0.0922, 0.1273 - 0.1157], abs=1e-12)
 

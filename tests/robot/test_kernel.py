@@ -34,7 +34,8 @@ def test_jacobians_agree_with_differences(statics: str, gravity_frame: str, seed
     )
     n = 3
     poses = kernel.poses(
-        rng.uniform(-1, 1, (n, model.n_joints)), ["load", None, "load"],
+        rng.uniform(-1, 1, (n, model.n_joints)),
+        ["load", None, "load"],
         {"time_s": rng.uniform(0, 3600, n), "approach1": rng.choice([-1, 1], n)},
     )
     theta = kernel.theta0 + random_theta(rng, kernel.names) * np.array(
@@ -90,7 +91,8 @@ def _pinocchio(model: RobotModel):  # type: ignore[no-untyped-def]
         robot.appendBodyToJoint(parent, pin.Inertia(f.mass, np.zeros(3), np.zeros((3, 3))), body)
     for payload in model.payloads.values():
         robot.appendBodyToJoint(
-            parent, pin.Inertia(payload.mass, np.zeros(3), np.zeros((3, 3))),
+            parent,
+            pin.Inertia(payload.mass, np.zeros(3), np.zeros((3, 3))),
             carried * pin.SE3(np.eye(3), np.array(payload.cog)),
         )
     return pin, robot, parent, carried

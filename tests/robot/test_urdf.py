@@ -106,9 +106,7 @@ def test_template_gets_the_calibrated_geometry_and_keeps_its_meshes(seed):
     text = _random_urdf(rng)
     nominal = model_from_urdf(text)
     kinds = ("x", "y", "z", "roll", "pitch", "yaw")
-    real = nominal.with_parameters(
-        {f"{f.name}.{k}": 1e-3 * rng.normal() for f in nominal.frames[:-1] for k in kinds}
-    )
+    real = nominal.with_parameters({f"{f.name}.{k}": 1e-3 * rng.normal() for f in nominal.frames[:-1] for k in kinds})
     written = urdf_text(real, template=text)
     assert written.count("<mesh") == text.count("<mesh")
     from robcal.robot.urdf import calibrated_frames
