@@ -5,7 +5,7 @@
 Simulated plate, one self-calibrated camera (8 numbers, so that COLMAP's OPENCV model is the same), start values off by
 1 % in focal length, without distortion, millimetres in the points. robcal's time includes robust start, data snooping,
 redundancy numbers and the full covariance of points, camera and stations; pycolmap's its adjustment and its own
-covariance of points and stations (conditional ones, see robcal/photogrammetry/colmap_engine.py); scipy's only the
+covariance of points and stations (conditional, see robcal/photogrammetry/bundle/colmap_engine.py); scipy's only the
 adjustment (sparse Jacobian, analytic).
 """
 
@@ -18,12 +18,12 @@ import numpy as np
 import pycolmap
 from scipy import optimize, sparse
 
-from robcal.photogrammetry.bundle import adjust
-from robcal.photogrammetry.bundle_normals import MarkOrder, State, linearise
-from robcal.photogrammetry.camera import Camera, project
-from robcal.photogrammetry.colmap_engine import to_reconstruction
-from robcal.photogrammetry.determinacy import intrinsics_basis
-from robcal.photogrammetry.network import ImageMarks
+from robcal.photogrammetry.bundle.adjustment import adjust
+from robcal.photogrammetry.bundle.colmap_engine import to_reconstruction
+from robcal.photogrammetry.bundle.determinacy import intrinsics_basis
+from robcal.photogrammetry.bundle.normals import MarkOrder, State, linearise
+from robcal.photogrammetry.core.camera import Camera, project
+from robcal.photogrammetry.core.network import ImageMarks
 from robcal.transforms import Array, fit_frame, frame, retract, transform
 
 FREE = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")

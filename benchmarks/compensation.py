@@ -18,9 +18,9 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.robot_file import read_robot
-from robcal.robot.c_export import export_c
 from robcal.robot.chain import chain_of, forward
 from robcal.robot.compensation import CompensationSettings, cell_frames, compensate
+from robcal.robot.export.c_export import export_c
 from robcal.robot.inverse import conditioning
 from robcal.robot.kernel import Kernel
 from robcal.robot.model import Payload, RobotModel

@@ -30,8 +30,8 @@ from fixtures.image_campaign import full_campaign
 from robcal.imaging.detect import detect_targets
 from robcal.imaging.detections import Detections
 from robcal.imaging.settings import DetectionSettings
-from robcal.photogrammetry.network import Lengths
-from robcal.photogrammetry.survey import BodyTarget, SurveyImage, SurveyResult, survey_body
+from robcal.photogrammetry.core.network import Lengths
+from robcal.photogrammetry.survey.survey import BodyTarget, SurveyImage, SurveyResult, survey_body
 
 Array = np.ndarray
 

@@ -8,7 +8,7 @@ from pipeline.body_file import BodyFile
 from pipeline.campaign import Campaign
 from pipeline.runs import Run
 from robcal.errors import InvalidInput
-from robcal.photogrammetry.bodies import Body
+from robcal.photogrammetry.core.bodies import Body
 
 
 def body_from_file(name: str, file: BodyFile) -> Body:

@@ -13,7 +13,7 @@ from pipeline.robot_file import Placement, placement_data
 from pipeline.schemas import Entry, Number, Positive, read_entry, shown
 from pipeline.yaml_io import FlowMapping, yaml_text
 from robcal.errors import InvalidInput
-from robcal.photogrammetry.camera import INTRINSIC_NAMES, Camera
+from robcal.photogrammetry.core.camera import INTRINSIC_NAMES, Camera
 from robcal.transforms import Array
 
 FORMAT = "robcal/camera-1"

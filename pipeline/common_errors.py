@@ -6,9 +6,9 @@ import numpy as np
 
 from pipeline.stages.observations import RobotObservations, RobotRecording, Rows
 from robcal.calibration.observations import FrameObservations, PointObservations
-from robcal.photogrammetry.bodies import Body
-from robcal.photogrammetry.measured_points import MeasuredPoints
-from robcal.photogrammetry.station_network import StationOrientation
+from robcal.photogrammetry.core.bodies import Body
+from robcal.photogrammetry.measure.measured_points import MeasuredPoints
+from robcal.photogrammetry.station.network import StationOrientation
 from robcal.transforms import Array
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from pipeline.calibrated import load_calibrated
 from pipeline.files import write_text
 from pipeline.runs import open_run
-from robcal.robot.c_export import export_c
+from robcal.robot.export.c_export import export_c
 from robcal.robot.urdf import urdf_text
 
 

@@ -12,16 +12,16 @@ from pipeline.bodies import surveyed_or_given
 from pipeline.campaign import Campaign
 from pipeline.runs import Run
 from pipeline.tables import read_table
-from robcal.diagnosis.image_data import survey_data
-from robcal.diagnosis.image_diagnosis import ImageDiagnosis, ImageFinding, diagnose_images
-from robcal.diagnosis.image_exchange import exchanged_targets
-from robcal.diagnosis.image_station import given_points, station_data
-from robcal.diagnosis.lens_findings import beyond_lenses, station_findings, survey_findings
-from robcal.diagnosis.scale_findings import scale_findings
-from robcal.photogrammetry.camera import Camera
-from robcal.photogrammetry.seen_normals import Ellipses
-from robcal.photogrammetry.station_network import StationMarks, StationOrientation
-from robcal.photogrammetry.survey_types import SurveyResult
+from robcal.diagnosis.images.data import survey_data
+from robcal.diagnosis.images.diagnosis import ImageDiagnosis, ImageFinding, diagnose_images
+from robcal.diagnosis.images.exchange import exchanged_targets
+from robcal.diagnosis.images.lens_findings import beyond_lenses, station_findings, survey_findings
+from robcal.diagnosis.images.scale_findings import scale_findings
+from robcal.diagnosis.images.station import given_points, station_data
+from robcal.photogrammetry.core.camera import Camera
+from robcal.photogrammetry.station.network import StationMarks, StationOrientation
+from robcal.photogrammetry.station.seen_normals import Ellipses
+from robcal.photogrammetry.survey.types import SurveyResult
 from robcal.transforms import Array
 
 SHAPES = "shapes"

@@ -15,9 +15,9 @@ from robcal.calibration.identification import identify
 from robcal.diagnosis.next_poses import poses_table, row_of
 from robcal.diagnosis.recording import Recording
 from robcal.errors import RobcalError
-from robcal.photogrammetry.measure_frames import measure_frames
-from robcal.photogrammetry.measure_points import measure_points
-from robcal.photogrammetry.station_network import StationMarks, StationOrientation
+from robcal.photogrammetry.measure.frames import measure_frames
+from robcal.photogrammetry.measure.points import measure_points
+from robcal.photogrammetry.station.network import StationMarks, StationOrientation
 from robcal.robot.kernel import Kernel
 from robcal.robot.model import RobotModel
 

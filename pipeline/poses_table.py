@@ -150,7 +150,8 @@ def _outside(table: Table, robot: RobotModel, q: Array) -> str:
             return str(
                 table.error(
                     i,
-                    f"{column} = {q[i, k] / factor:g} {unit} lies outside the range {low / factor:g} to {high / factor:g} "
+                    f"{column} = {q[i, k] / factor:g} {unit} lies outside the range {low / factor:g} to "
+                    f"{high / factor:g} "
                     f"{unit} of {joint.name} ({int(outside.sum())} such poses): correct the angle, or the range in the "
                     "robot file",
                 )

@@ -18,7 +18,7 @@ from pipeline.runs import open_run
 from pipeline.tables import read_table, write_table
 from robcal.errors import InvalidInput
 from robcal.robot.compensation import cell_frames, compensate
-from robcal.robot.controller_formats import frame_program, joint_program
+from robcal.robot.export.controller_formats import frame_program, joint_program
 from robcal.robot.kernel import Kernel
 from robcal.robot.model import RobotModel
 from robcal.transforms import Array, difference, frame_from_xyzrpy

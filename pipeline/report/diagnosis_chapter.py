@@ -14,7 +14,7 @@ from pipeline.report.material import Material
 from pipeline.report.robot_plot import robot_figure
 from pipeline.report.style import AFTER, BEFORE, GREY, label, layout, number, percent, probability, rounded, to_sigma
 from robcal.calibration.observations import PointObservations
-from robcal.photogrammetry.camera import Camera
+from robcal.photogrammetry.core.camera import Camera
 from robcal.transforms import Array
 
 LEVEL = 0.01

@@ -9,7 +9,7 @@ import numpy as np
 
 from pipeline.report.blocks import Figure
 from pipeline.report.style import AFTER, BEFORE, GREY, label, layout, number, rounded
-from robcal.photogrammetry.camera import INTRINSIC_NAMES, Camera
+from robcal.photogrammetry.core.camera import INTRINSIC_NAMES, Camera
 from robcal.transforms import Array
 
 _RADIAL = tuple(INTRINSIC_NAMES.index(name) for name in ("k1", "k2", "k3"))

@@ -13,10 +13,10 @@ from pipeline.runs import Run, campaign_of, read_json, run_file
 from pipeline.stages.registry import STAGES
 from robcal.calibration.verification import Verification
 from robcal.errors import RobcalError
-from robcal.photogrammetry.measure_frames import MeasuredFrames
-from robcal.photogrammetry.measured_points import MeasuredPoints
-from robcal.photogrammetry.station_network import StationOrientation
-from robcal.photogrammetry.survey_types import SurveyResult
+from robcal.photogrammetry.measure.frames import MeasuredFrames
+from robcal.photogrammetry.measure.measured_points import MeasuredPoints
+from robcal.photogrammetry.station.network import StationOrientation
+from robcal.photogrammetry.survey.types import SurveyResult
 
 
 @dataclass(frozen=True)

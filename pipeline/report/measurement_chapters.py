@@ -7,7 +7,7 @@ import numpy as np
 from pipeline.report.blocks import Block, Chapter, Figure, Text, table
 from pipeline.report.material import Material
 from pipeline.report.style import ACCENT, AFTER, GREY, layout, number, rounded
-from robcal.photogrammetry.measure_frames import MeasuredFrames, PairDeviations
+from robcal.photogrammetry.measure.frames import MeasuredFrames, PairDeviations
 
 
 def measurement_chapter(material: Material) -> Chapter:

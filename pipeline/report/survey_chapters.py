@@ -7,10 +7,10 @@ import numpy as np
 from pipeline.report.blocks import Block, Chapter, Figure, Table, Text, table
 from pipeline.report.material import Material
 from pipeline.report.style import ACCENT, AFTER, BEFORE, CATEGORIES, GREEN, GREY, label, number, rounded, scene
-from robcal.photogrammetry.camera import INTRINSIC_NAMES, Camera
-from robcal.photogrammetry.network import CameraNetwork, LengthResult
-from robcal.photogrammetry.station_network import StationOrientation
-from robcal.photogrammetry.survey_types import SurveyResult
+from robcal.photogrammetry.core.camera import INTRINSIC_NAMES, Camera
+from robcal.photogrammetry.core.network import CameraNetwork, LengthResult
+from robcal.photogrammetry.station.network import StationOrientation
+from robcal.photogrammetry.survey.types import SurveyResult
 from robcal.transforms import Array, invert
 
 

@@ -28,13 +28,13 @@ from robcal.calibration.observations import FrameObservations
 from robcal.diagnosis.contract import as_contract, with_images
 from robcal.diagnosis.diagnose import diagnose
 from robcal.diagnosis.fitting import Accepted, Fit, fit
-from robcal.diagnosis.image_diagnosis import ImageFinding
+from robcal.diagnosis.images.diagnosis import ImageFinding
 from robcal.diagnosis.recording import Recording
 from robcal.diagnosis.result import Diagnosis
 from robcal.diagnosis.selection import SelectionSettings
-from robcal.photogrammetry.bodies import Body
-from robcal.photogrammetry.measured_points import MeasuredPoints
-from robcal.photogrammetry.station_network import StationOrientation
+from robcal.photogrammetry.core.bodies import Body
+from robcal.photogrammetry.measure.measured_points import MeasuredPoints
+from robcal.photogrammetry.station.network import StationOrientation
 from robcal.physics.usual import DEVIATION
 from robcal.transforms import Array
 

@@ -14,10 +14,10 @@ from pipeline.runs import Run
 from pipeline.stages.base import Context, Outcome, Stage
 from pipeline.tables import write_table
 from robcal.errors import InvalidInput
-from robcal.photogrammetry.bodies import Body, line_ratio
-from robcal.photogrammetry.measure_frames import MeasuredFrames, measure_frames
-from robcal.photogrammetry.measured_points import MeasuredPoints
-from robcal.photogrammetry.point_faults import length_ratio, mirrored, unit_fault
+from robcal.photogrammetry.core.bodies import Body, line_ratio
+from robcal.photogrammetry.measure.frames import MeasuredFrames, measure_frames
+from robcal.photogrammetry.measure.measured_points import MeasuredPoints
+from robcal.photogrammetry.measure.point_faults import length_ratio, mirrored, unit_fault
 from robcal.transforms import Array, xyzrpy_from_frame
 
 NAME = "frames"

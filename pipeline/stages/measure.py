@@ -11,7 +11,7 @@ from pipeline.stages.base import Context, Outcome, Stage
 from pipeline.stages.orient import station_points
 from pipeline.tables import write_table
 from robcal.errors import InvalidInput
-from robcal.photogrammetry.measured_points import MeasuredPoints
+from robcal.photogrammetry.measure.measured_points import MeasuredPoints
 
 NAME = "measure"
 

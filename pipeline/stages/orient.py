@@ -21,22 +21,22 @@ from pipeline.runs import Run
 from pipeline.stages.base import Context, Outcome, Stage
 from pipeline.stages.detect import DetectionIndex, load_detections
 from pipeline.stages.survey import located, size_of_marks
-from robcal.diagnosis.camera_moves import which_moved, with_small_moves
-from robcal.diagnosis.dot_sizes import with_dot_sizes
-from robcal.diagnosis.image_data import ImageData
-from robcal.diagnosis.image_diagnosis import ImageFinding
-from robcal.diagnosis.image_station import station_data
-from robcal.diagnosis.light_lag import without_lag
+from robcal.diagnosis.images.camera_moves import which_moved, with_small_moves
+from robcal.diagnosis.images.data import ImageData
+from robcal.diagnosis.images.diagnosis import ImageFinding
+from robcal.diagnosis.images.dot_sizes import with_dot_sizes
+from robcal.diagnosis.images.light_lag import without_lag
+from robcal.diagnosis.images.station import station_data
 from robcal.errors import InvalidInput, RobcalError
 from robcal.imaging.detections import Detections
-from robcal.photogrammetry.bodies import Body
-from robcal.photogrammetry.camera import INTRINSIC_NAMES, Camera
-from robcal.photogrammetry.identify_station import identify_station
-from robcal.photogrammetry.measure_points import measure_points
-from robcal.photogrammetry.measured_points import MeasuredPoints
-from robcal.photogrammetry.seen_normals import ellipses_of, needs_normals, with_seen_normals
-from robcal.photogrammetry.station import orient_station
-from robcal.photogrammetry.station_network import StationMarks, StationOrientation, StationSettings
+from robcal.photogrammetry.core.bodies import Body
+from robcal.photogrammetry.core.camera import INTRINSIC_NAMES, Camera
+from robcal.photogrammetry.measure.measured_points import MeasuredPoints
+from robcal.photogrammetry.measure.points import measure_points
+from robcal.photogrammetry.station.identify import identify_station
+from robcal.photogrammetry.station.network import StationMarks, StationOrientation, StationSettings
+from robcal.photogrammetry.station.orientation import orient_station
+from robcal.photogrammetry.station.seen_normals import ellipses_of, needs_normals, with_seen_normals
 
 NAME = "orient"
 

@@ -17,11 +17,11 @@ from pipeline.runs import Run
 from pipeline.stages.base import Context, Outcome, Stage
 from pipeline.stages.detect import DetectionIndex, load_detections, sizes
 from robcal.errors import DegenerateGeometry, InvalidInput, NotIdentifiable, RobcalError
-from robcal.photogrammetry.bodies import Body
-from robcal.photogrammetry.camera import INTRINSIC_NAMES
-from robcal.photogrammetry.colmap_engine import export_colmap
-from robcal.photogrammetry.network import Lengths
-from robcal.photogrammetry.survey import BodyTarget, SurveyImage, SurveyResult, survey_body
+from robcal.photogrammetry.bundle.colmap_engine import export_colmap
+from robcal.photogrammetry.core.bodies import Body
+from robcal.photogrammetry.core.camera import INTRINSIC_NAMES
+from robcal.photogrammetry.core.network import Lengths
+from robcal.photogrammetry.survey.survey import BodyTarget, SurveyImage, SurveyResult, survey_body
 
 NAME = "survey"
 

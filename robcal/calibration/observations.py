@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from robcal import transforms as tf
 from robcal.errors import InvalidInput
-from robcal.photogrammetry.camera import Camera, project_with_jacobians
+from robcal.photogrammetry.core.camera import Camera, project_with_jacobians
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -23,7 +23,7 @@ from robcal.calibration.collision import (
 )
 from robcal.calibration.visibility import Viewpoint, VisibilityRules, measurable, seen_targets, target_normals
 from robcal.errors import InvalidInput
-from robcal.photogrammetry.bodies import Body
+from robcal.photogrammetry.core.bodies import Body
 from robcal.robot.chain import Chain, chain_of, forward
 from robcal.robot.inverse import inverse_kinematics
 from robcal.robot.model import RobotModel

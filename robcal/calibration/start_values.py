@@ -29,7 +29,7 @@ from robcal.calibration.observations import (
     SensorPointObservations,
 )
 from robcal.errors import DegenerateGeometry, RobcalError
-from robcal.photogrammetry.camera import normalise
+from robcal.photogrammetry.core.camera import normalise
 
 Array = NDArray[np.float64]
 Pair = tuple[Array, Array]

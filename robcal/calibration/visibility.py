@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from robcal.calibration.collision import PlacedCapsules, segment_distance
 from robcal.errors import InvalidInput
-from robcal.photogrammetry.bodies import Body
-from robcal.photogrammetry.camera import Camera, project, project_with_jacobians
+from robcal.photogrammetry.core.bodies import Body
+from robcal.photogrammetry.core.camera import Camera, project, project_with_jacobians
 from robcal.transforms import Array, invert, skew, transform
 
 _SIGHT_MARGIN = 0.02

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from robcal.diagnosis.image_diagnosis import ImageDiagnosis, ImageFinding
+from robcal.diagnosis.images.diagnosis import ImageDiagnosis, ImageFinding
 from robcal.diagnosis.next_poses import poses_table
 from robcal.diagnosis.result import Diagnosis, Finding
 

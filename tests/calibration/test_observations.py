@@ -18,7 +18,7 @@ from robcal.calibration.observations import (
     basis_points,
 )
 from robcal.errors import InvalidInput
-from robcal.photogrammetry.camera import Camera
+from robcal.photogrammetry.core.camera import Camera
 
 
 def _operators(rng: np.random.Generator, T: np.ndarray) -> list:

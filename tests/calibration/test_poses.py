@@ -24,8 +24,8 @@ from robcal.calibration.pose_order import balanced_approaches, joint_ranges, pat
 from robcal.calibration.poses import PoseRequest, generate_poses
 from robcal.calibration.visibility import Viewpoint, VisibilityRules, measurable, seen_targets
 from robcal.errors import InvalidInput
-from robcal.photogrammetry.bodies import Body
-from robcal.photogrammetry.camera import Camera
+from robcal.photogrammetry.core.bodies import Body
+from robcal.photogrammetry.core.camera import Camera
 from robcal.robot.chain import chain_of, forward
 from robcal.robot.kernel import Kernel
 from robcal.robot.model import Frame, RobotModel

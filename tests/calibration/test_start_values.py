@@ -18,7 +18,7 @@ from robcal.calibration.observations import (
 from robcal.calibration.problem import Evaluator
 from robcal.calibration.start_values import candidates, hand_eye
 from robcal.errors import NotIdentifiable
-from robcal.photogrammetry.camera import Camera, project
+from robcal.photogrammetry.core.camera import Camera, project
 from robcal.robot.kernel import Kernel
 from robcal.robot.model import Frame, RobotModel
 from tests.robot.chains import kr_like

@@ -15,8 +15,8 @@ from robcal.calibration.visibility import (
     target_normals,
 )
 from robcal.errors import InvalidInput
-from robcal.photogrammetry.bodies import Body
-from robcal.photogrammetry.camera import Camera, project
+from robcal.photogrammetry.core.bodies import Body
+from robcal.photogrammetry.core.camera import Camera, project
 from robcal.transforms import frame_from_xyzrpy, invert, retract, transform
 
 CAMERA = Camera(2000, 1500, 3000.0, 3000.0, 999.5, 749.5, k1=-0.1)

@@ -11,16 +11,16 @@ import numpy as np
 from fixtures.effects import Effect
 from fixtures.measuring_effects import swap_labels
 from fixtures.sightings import LENS, Marks, Scene, SightingPlan, draw_scene, draw_sighting_effect, sight, view_name
-from robcal.diagnosis.image_data import ImageData
-from robcal.diagnosis.image_diagnosis import ImageFinding, diagnose_images
-from robcal.diagnosis.image_station import station_data
-from robcal.diagnosis.lens_findings import station_findings
-from robcal.photogrammetry.bodies import Body
-from robcal.photogrammetry.camera import Camera
-from robcal.photogrammetry.network import Lengths
-from robcal.photogrammetry.station import orient_station
-from robcal.photogrammetry.station_network import StationMarks, StationOrientation
-from robcal.photogrammetry.survey import BodyTarget, SurveyImage, SurveyResult, survey_body
+from robcal.diagnosis.images.data import ImageData
+from robcal.diagnosis.images.diagnosis import ImageFinding, diagnose_images
+from robcal.diagnosis.images.lens_findings import station_findings
+from robcal.diagnosis.images.station import station_data
+from robcal.photogrammetry.core.bodies import Body
+from robcal.photogrammetry.core.camera import Camera
+from robcal.photogrammetry.core.network import Lengths
+from robcal.photogrammetry.station.network import StationMarks, StationOrientation
+from robcal.photogrammetry.station.orientation import orient_station
+from robcal.photogrammetry.survey.survey import BodyTarget, SurveyImage, SurveyResult, survey_body
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,9 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from robcal.photogrammetry.camera import Camera, project
-from robcal.photogrammetry.network import ImageMarks
-from robcal.photogrammetry.survey import SurveyImage
+from robcal.photogrammetry.core.camera import Camera, project
+from robcal.photogrammetry.core.network import ImageMarks
+from robcal.photogrammetry.survey.survey import SurveyImage
 from robcal.transforms import Array, frame, transform
 
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from robcal.photogrammetry.bodies import Body
-from robcal.photogrammetry.camera import Camera, project
-from robcal.photogrammetry.station_network import StationMarks
+from robcal.photogrammetry.core.bodies import Body
+from robcal.photogrammetry.core.camera import Camera, project
+from robcal.photogrammetry.station.network import StationMarks
 from robcal.transforms import Array, exp_so3, frame, invert, transform
 
 SIZE = (2448, 2048)

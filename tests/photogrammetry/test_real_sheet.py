@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 import yaml
 
-from robcal.photogrammetry.bundle import AdjustSettings
-from robcal.photogrammetry.camera import Camera
-from robcal.photogrammetry.network import Lengths
-from robcal.photogrammetry.survey import BodyTarget, SurveyImage, SurveySettings, survey_body
+from robcal.photogrammetry.bundle.adjustment import AdjustSettings
+from robcal.photogrammetry.core.camera import Camera
+from robcal.photogrammetry.core.network import Lengths
+from robcal.photogrammetry.survey.survey import BodyTarget, SurveyImage, SurveySettings, survey_body
 
 FOLDER = Path(__file__).resolve().parents[3] / "shared" / "real" / "dbat_camcal"
 pytestmark = pytest.mark.skipif(not FOLDER.is_dir(), reason="recordings dbat_camcal are not there")

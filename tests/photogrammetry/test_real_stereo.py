@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 import yaml
 
-from robcal.photogrammetry.bodies import Body
-from robcal.photogrammetry.camera import Camera
-from robcal.photogrammetry.measure_frames import measure_frames
-from robcal.photogrammetry.measure_points import measure_points
-from robcal.photogrammetry.station import orient_station
-from robcal.photogrammetry.station_network import StationMarks
+from robcal.photogrammetry.core.bodies import Body
+from robcal.photogrammetry.core.camera import Camera
+from robcal.photogrammetry.measure.frames import measure_frames
+from robcal.photogrammetry.measure.points import measure_points
+from robcal.photogrammetry.station.network import StationMarks
+from robcal.photogrammetry.station.orientation import orient_station
 
 DATA = Path(__file__).parents[3] / "shared" / "real" / "opencv_stereo_chess"
 pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason="recorded data are not beside this checkout")

@@ -20,8 +20,8 @@ from pipeline.runner import run_campaign
 from pipeline.runs import Run
 from pipeline.stages.diagnose import settings_beside
 from pipeline.stages.identify import load_identification
-from robcal.diagnosis.camera_moves import epochs_of
-from robcal.diagnosis.image_diagnosis import ImageFinding
+from robcal.diagnosis.images.camera_moves import epochs_of
+from robcal.diagnosis.images.diagnosis import ImageFinding
 from robcal.diagnosis.selection import SelectionSettings
 
 PLAN = {"seed": 21, "robot": "ur10", "poses": 50, "verify": 10, "kept_out": 30}

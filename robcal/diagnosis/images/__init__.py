@@ -1,0 +1,1 @@
+"""What the images say: causes of cameras, targets and bodies."""

@@ -1,0 +1,228 @@
+"""What surveys and stations found and corrected by themselves, told as causes: lens groups left out of a camera's file,
+cameras that moved, targets that sit elsewhere."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy import stats
+
+from robcal.diagnosis.images.diagnosis import ImageFinding
+from robcal.photogrammetry.core.bodies import Body
+from robcal.photogrammetry.core.camera import INTRINSIC_NAMES, Camera
+from robcal.photogrammetry.core.network import CameraNetwork
+from robcal.photogrammetry.station.network import Evidence, StationOrientation
+from robcal.physics.family import Array
+
+LENS_GROUPS: Mapping[str, tuple[str, ...]] = {
+    "lens_radial": ("k1", "k2", "k3"),
+    "lens_tangential": ("p1", "p2"),
+    "lens_affinity": ("fx", "fy"),
+}
+KIND = {"lens_radial": "radial distortion", "lens_tangential": "tangential distortion", "lens_affinity": "affinity"}
+LEVEL = 1e-4
+"""Significance from which a lens group is a cause. Marks of an image share small errors, hence more than 1 %."""
+
+TANGENTIAL = 0.01
+AFFINITY = 2e-3
+"""Decentring (|p1|, |p2|) and relative difference of fx and fy beyond which no lens or sensor is built: glass or water
+in front of it bends images so."""
+EXCHANGED = 0.05
+"""Two shifted targets are swapped if they miss each other's place by less than this share of their distance."""
+
+
+def survey_findings(network: CameraNetwork, start: Camera | None, name: str) -> tuple[ImageFinding, ...]:
+    """Lens groups that the given camera file has at zero and the self-calibration finds significant.
+
+    Wald test on the adjusted numbers; "before" is the root mean square that the images would have without the group,
+    everything else adjusted anew to first order; both as errors of marks that are predicted without themselves.
+    """
+    if start is None:
+        return ()
+    found = []
+    marks = len(network.marks)
+    rms, alone = network.rms_px, _predicted(marks, network.redundancy_total)
+    for cause, group in LENS_GROUPS.items():
+        if cause == "lens_affinity":
+            given, contrast = start.fy - start.fx, _difference()
+        else:
+            given = float(np.abs([getattr(start, n) for n in group]).max())
+            contrast = np.array(
+                [[float(n == m) for m in INTRINSIC_NAMES] for n in group if n in network.free_intrinsics]
+            )
+        if abs(given) > 1e-9 or not len(contrast):
+            continue
+        values = contrast @ network.camera.vector
+        covariance = contrast @ network.intrinsics_covariance @ contrast.T
+        if not np.all(np.diag(covariance) > 0):
+            continue
+        statistic = float(values @ np.linalg.solve(covariance, values))
+        p_value = float(stats.chi2.sf(statistic, len(values)))
+        before = float(np.sqrt(rms**2 + statistic * network.sigma0_px**2 / (2 * marks)))
+        if p_value > LEVEL:
+            continue
+        names = ["fy_minus_fx_px"] if cause == "lens_affinity" else [n for n in group if n in network.free_intrinsics]
+        told = dict(zip(names, map(float, values), strict=True))
+        sigma = dict(zip(names, map(float, np.sqrt(np.diag(covariance))), strict=True))
+        text = f"The lens of camera '{name}' has {KIND[cause]} that its file leaves out"
+        found.append(
+            (
+                statistic,
+                ImageFinding(
+                    cause,
+                    "camera",
+                    name,
+                    None,
+                    dict(told),
+                    dict(sigma),
+                    p_value,
+                    (),
+                    (alone * before, alone * rms),
+                    text,
+                ),
+            )
+        )
+    return tuple(finding for _, finding in sorted(found, key=lambda item: -item[0]))
+
+
+def _predicted(marks: int, redundancy: float) -> float:
+    """Factor from residuals to errors of marks predicted without themselves: one by the mean redundancy number."""
+    return 2 * marks / redundancy if redundancy > 0 else float("nan")
+
+
+def _difference() -> Array:
+    row = np.zeros((1, len(INTRINSIC_NAMES)))
+    row[0, INTRINSIC_NAMES.index("fy")], row[0, INTRINSIC_NAMES.index("fx")] = 1.0, -1.0
+    return row
+
+
+def station_findings(
+    orientation: StationOrientation,
+    pose_names: tuple[str, ...],
+    given: Body | None = None,
+    inflation: Mapping[str, float] | None = None,
+    explained: frozenset[str] = frozenset(),
+) -> Iterator[ImageFinding]:
+    """Recurring contradictions that the station's adjustment freed, strongest first.
+
+    Parameters
+    ----------
+    pose_names : names of all poses. given : the body with the coordinates of its file, to see exchanged targets.
+    inflation : cause -> factor by which such scores scatter where nothing is wrong (errors common to an image).
+    explained : targets whose place is explained already.
+    """
+    marks = len(orientation.marks)
+    rms, alone = orientation.rms_px, _predicted(marks, orientation.redundancy_total)
+    for item in sorted(_with_swaps(orientation.evidence, given), key=lambda e: -e.statistic):
+        told, sigma, stage, text = _told(orientation, item, pose_names)
+        if told is None:
+            continue
+        statistic = item.statistic / (inflation or {}).get(item.kind, 1.0)
+        p_value = float(stats.chi2.sf(statistic, item.degrees))
+        if p_value > LEVEL or (item.kind == "target_shifted" and item.where in explained):
+            continue
+        before = float(np.sqrt(rms**2 * (1.0 + item.statistic / (2 * marks)))) if np.isfinite(statistic) else np.nan
+        rivals: tuple[tuple[str, str], ...] = ()
+        if item.kind == "camera_moved" and len(orientation.names) == 2 and not item.alone:
+            other = next(name for name in orientation.names if name != item.where)
+            rivals = (("camera_moved", other),)
+        where = item.where.split(",")[0]
+        yield ImageFinding(
+            item.kind, stage, where, None, told, sigma, p_value, rivals, (alone * before, alone * rms), text
+        )
+
+
+def beyond_lenses(findings: Sequence[ImageFinding], cameras: Mapping[str, Camera]) -> tuple[ImageFinding, ...]:
+    """Findings in which lens terms of a size that no lens has are told as what they stand for: refraction.
+
+    A camera looks through glass or water; in few images decentring and affinity take over most of what that does.
+    Where refraction is found on the same camera too, the terms are told beside it, as what it is hard to tell from.
+
+    Parameters
+    ----------
+    cameras : adjusted interior orientation by name, of the cameras that the findings speak of.
+    """
+    strange = [f for f in findings if f.where in cameras and _strange(f, cameras[f.where])]
+    out = [f for f in findings if f not in strange]
+    for where in dict.fromkeys(f.where for f in strange):
+        terms = [f for f in strange if f.where == where]
+        rivals = tuple((f.cause, where) for f in terms)
+        at = next((i for i, f in enumerate(out) if (f.cause, f.where) == ("refraction", where)), None)
+        if at is not None:
+            least = min(f.p_value for f in (out[at], *terms))
+            out[at] = replace(out[at], rivals=(*out[at].rivals, *rivals), p_value=least)
+            continue
+        formula = "; ".join(f"{name} = {value:.4g}" for f in terms for name, value in f.parameters.items())
+        term = {"variables": ["x_px", "y_px"], "kind": "formula", "formula": f"lens terms {formula}"}
+        best = min(terms, key=lambda f: f.p_value)
+        text = f"Camera {where} looks through glass or water: its images are bent more than any lens does ({formula})"
+        parameters: dict[str, object] = {"term": term}
+        out.append(replace(best, cause="refraction", parameters=parameters, sigma={}, rivals=rivals, statement=text))
+    return tuple(sorted(out, key=lambda f: f.cause != "refraction")) if strange else tuple(findings)
+
+
+def _strange(finding: ImageFinding, camera: Camera) -> bool:
+    if finding.cause == "lens_tangential":
+        return max(abs(camera.p1), abs(camera.p2)) > TANGENTIAL
+    return finding.cause == "lens_affinity" and abs(camera.fy - camera.fx) > AFFINITY * camera.fx
+
+
+def _with_swaps(evidence: Sequence[Evidence], given: Body | None) -> list[Evidence]:
+    """Two targets of which each sits where the file has the other are swapped, not shifted."""
+    left = list(evidence)
+    if given is None:
+        return left
+    shifted = [item for item in evidence if item.kind == "target_shifted"]
+    for k, a in enumerate(shifted):
+        for b in shifted[k + 1 :]:
+            i, j = (int(given.index([int(item.where)])[0]) for item in (a, b))
+            way = given.points[j] - given.points[i]
+            near = EXCHANGED * float(np.linalg.norm(way))
+            exchange = np.linalg.norm(a.estimate - way) < near and np.linalg.norm(b.estimate + way) < near
+            if exchange and a in left and b in left:
+                left.remove(a)
+                left.remove(b)
+                pair = f"{a.where},{b.where}"
+                statistic = a.statistic + b.statistic
+                left.append(Evidence("target_swapped", pair, None, way, a.covariance, statistic, 6, a.statement))
+    return left
+
+
+def _told(
+    orientation: StationOrientation, item: Evidence, pose_names: tuple[str, ...]
+) -> tuple[dict[str, object] | None, dict[str, object], str, str]:
+    spread = np.sqrt(np.clip(np.diag(item.covariance), 0.0, None))
+    if item.kind in LENS_GROUPS:
+        camera = orientation.cameras[orientation.names.index(item.where)]
+        free = [n for n in LENS_GROUPS[item.kind] if n in {"p1", "p2", *orientation.free_interior[item.where]}]
+        if item.kind == "lens_affinity":
+            told: dict[str, object] = {"fy_minus_fx_px": camera.fy - camera.fx}
+        else:
+            told = {name: float(getattr(camera, name)) for name in free}
+        text = f"The lens of camera '{item.where}' has {KIND[item.kind]} that its file leaves out"
+        return told, dict(zip(told, map(float, spread), strict=False)), "camera", text
+    if item.kind == "camera_moved" and item.pose is not None:
+        label = pose_names[item.pose]
+        scale = np.r_[np.full(3, 1e3), np.full(3, np.degrees(1.0))]
+        moved, covariance = item.estimate, item.covariance
+        of_camera = orientation.exterior_camera == orientation.names.index(item.where)
+        if item.pose in orientation.exterior_first_pose[of_camera]:  # as adjusted, not as tested for
+            moved, covariance = orientation.movement(item.where, item.pose)
+        values, sigmas = moved * scale, np.sqrt(np.clip(np.diag(covariance), 0.0, None)) * scale
+        told = {"pose": label, "shift_mm": values[:3].tolist(), "turn_deg": values[3:].tolist()}
+        text = (
+            f"Camera {item.where} moved before pose {label} by {np.linalg.norm(values[:3]):.3f} mm and "
+            f"{np.linalg.norm(values[3:]):.4f} deg"
+        )
+        return told, {"shift_mm": sigmas[:3].tolist(), "turn_deg": sigmas[3:].tolist()}, "camera", text
+    if item.kind == "target_swapped":
+        first, second = item.where.split(",")
+        text = f"Targets {first} and {second} are swapped: each sits where the file has the other"
+        return {"with": int(second)}, {}, "body", text
+    if item.kind == "target_shifted":
+        values = item.estimate * 1e3
+        text = f"Target {item.where} sits {np.linalg.norm(values):.3f} mm from where its file says"
+        return {"shift_mm": values.tolist()}, {"shift_mm": (spread * 1e3).tolist()}, "body", text
+    return None, {}, "camera", ""

@@ -1,0 +1,1 @@
+"""Bundle adjustment with lengths, datum, determinacy and snooping."""

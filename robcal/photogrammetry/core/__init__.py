@@ -1,0 +1,1 @@
+"""Cameras, networks, bodies, discs and the eccentricity of their images."""

@@ -1,0 +1,1 @@
+"""Which mark is which target."""

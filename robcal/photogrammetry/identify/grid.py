@@ -1,0 +1,159 @@
+"""A body with rows of uncoded dots (grid, stepped plate) found in one image among many false dots.
+
+Rows of the image (:mod:`identify_rows`) give poses, each pose grows to all dots it explains (:mod:`identify_grow`),
+and every rival numbering that the body's own shape allows (:mod:`identify_congruence`) is tried as hard as the best
+before it is believed: a grid shifted by one step explains all dots but those of its edge.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from robcal.photogrammetry.core.bodies import Body, IntArray
+from robcal.photogrammetry.core.camera import Camera
+from robcal.photogrammetry.identify.congruence import congruences
+from robcal.photogrammetry.identify.grow import (
+    Grown,
+    View,
+    grow,
+    log_odds,
+    rough_scores,
+    usual_error,
+    without_stragglers,
+)
+from robcal.photogrammetry.identify.rows import body_rows, image_rows, row_hypotheses
+from robcal.transforms import Array, invert
+
+_MIN_TARGETS = 12
+_SAME = 7.0
+"""Difference of log odds below which two numberings cannot be told apart (odds of 1000 to 1)."""
+_GROWN = 12
+_FEWEST = 0.35
+"""Share of the body's targets that must be seen."""
+_REASON = "the dots show no rows that fit the body's rows"
+
+
+def has_rows(points: Array) -> bool:
+    """True where a body is large and regular enough for this search."""
+    return len(points) >= _MIN_TARGETS and len(body_rows(points)) >= 2
+
+
+def search_grid(
+    camera: Camera,
+    xy: Array,
+    size: Array,
+    contrast: Array,
+    body: Body,
+    candidates: IntArray,
+    *,
+    model_error_px: float,
+    others: Sequence[View] = (),
+) -> tuple[list[Grown], str]:
+    """Numberings (targets are rows of ``candidates``) that cannot be told apart, the best first; else a reason.
+
+    Parameters
+    ----------
+    xy, size, contrast : (m, 2), (m,), (m,) of the image's dots. candidates : body rows that may appear.
+    model_error_px : error that the camera's start values may cause along two rows.
+    others : what cameras of known numbering see of the same body at the same time (by row of ``candidates``).
+    """
+    points = body.points[candidates]
+    rows = body_rows(points)
+    if len(rows) < 2 or len(xy) < _MIN_TARGETS:
+        return [], _REASON
+    chains = image_rows(xy, size, contrast, longest_step=0.12 * float(np.hypot(camera.width, camera.height)))
+    if len(chains) < 2:
+        return [], f"{len(chains)} rows of dots in the image, two are needed"
+    tolerance = model_error_px + 2.0
+    best: Grown | None = None
+    top = -np.inf
+    for poses, used in row_hypotheses(camera, xy, points, rows, chains, tolerance):
+        own = _like(size, contrast, used)
+        tree = cKDTree(xy[own])
+        score = np.concatenate(list(rough_scores(camera, poses, points, tree, 2.0 * tolerance)))
+        for k in np.argsort(-score, kind="stable")[:_GROWN]:
+            found = grow(camera, poses[k], points, xy[own], reach=2.0 * tolerance, tree=tree)
+            if found is None or found.rms > tolerance:
+                continue
+            density = _density(xy[own][found.dots], xy[own])
+            value = log_odds(found, points, sigma=usual_error(found.off), density=density)
+            if value > top:
+                top, best = value, _renumbered(found, own)
+        # half of a body is no accident; with less, other rows of the image may show more of it
+        if best is not None and len(best.dots) >= 0.5 * len(points) and _believed(best, len(points), top)[0]:
+            break
+    if best is None:
+        return [], _REASON
+    believed, why = _believed(best, len(points), top)
+    if not believed:
+        return [], why
+    return _with_rivals(camera, xy, size, contrast, points, best, tolerance, others), ""
+
+
+def _like(size: Array, contrast: Array, used: IntArray) -> IntArray:
+    """Rows of the dots that look like those of two chains."""
+    near = np.abs(np.log(size / np.median(size[used]))) < np.log(2.2)
+    near &= np.abs(np.log(np.abs(contrast) / np.median(np.abs(contrast[used])))) < np.log(4.0)
+    near[used] = True
+    return np.flatnonzero(near)
+
+
+def _renumbered(found: Grown, own: IntArray) -> Grown:
+    return Grown(own[found.dots], found.targets, found.camera_T_body, found.camera, found.off)
+
+
+def _density(matched: Array, like: Array) -> float:
+    """Other dots of like look (k, 2) per px^2 in the rectangle that the matched ones (n, 2) span."""
+    low, high = matched.min(axis=0), matched.max(axis=0)
+    inside = float(((like >= low) & (like <= high)).all(axis=1).sum()) - len(matched)
+    return max(inside, 3.0) / float(np.prod(np.maximum(high - low, 1.0)))
+
+
+def _believed(found: Grown, n: int, value: float) -> tuple[bool, str]:
+    """Enough dots, and log odds beyond all hypotheses that could have been tried (a million and a margin).
+
+    Five dots' worth of odds is spent on pose and lens.
+    """
+    kept = len(without_stragglers(found).dots)
+    if kept >= max(8, _FEWEST * n) and value * (1.0 - 5.0 / kept) > np.log(1e6) + _SAME:
+        return True, ""
+    return False, f"only {kept} of {n} targets fit the rows of dots in the image"
+
+
+def _with_rivals(
+    camera: Camera,
+    xy: Array,
+    size: Array,
+    contrast: Array,
+    points: Array,
+    best: Grown,
+    tolerance: float,
+    others: Sequence[View],
+) -> list[Grown]:
+    """The best numbering, after trying all that the body's shape allows, and those it does not clearly beat."""
+    own = _like(size, contrast, best.dots)
+    tree = cKDTree(xy[own])
+    pool = [best]
+    for motion in congruences(points, best.targets):
+        start = best.camera_T_body @ invert(motion)
+        rival = grow(camera, start, points, xy[own], reach=tolerance, tree=tree, lens=best.camera)
+        if rival is not None:
+            pool.append(_renumbered(rival, own))
+    pool = [without_stragglers(f) for f in pool]
+    sigma = min(usual_error(f.off) for f in pool if len(f.dots) >= 0.9 * max(len(g.dots) for g in pool))
+    density = _density(xy[best.dots], xy[own])
+    value = [log_odds(f, points, sigma=sigma, density=density, others=others) for f in pool]
+    order = np.argsort([-v for v in value], kind="stable")
+    first = pool[order[0]]
+    numbers = dict(zip(first.dots.tolist(), first.targets.tolist(), strict=True))
+    out = [first]
+    for k in order[1:]:
+        f = pool[k]
+        other = [numbers[int(d)] != int(t) for d, t in zip(f.dots, f.targets, strict=True) if int(d) in numbers]
+        # a stray dot more or less is the same numbering; a half turn may leave one row of several as it is
+        if (not other or np.mean(other) > 0.2) and value[k] > value[order[0]] - _SAME:
+            out.append(f)
+    return out

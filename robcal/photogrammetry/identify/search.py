@@ -1,0 +1,298 @@
+"""Finding an uncoded body in an image from its geometry alone: three-point hypotheses, verification, uniqueness.
+
+Each hypothesis puts three targets on three dots (P3P) and predicts all others. It is believed only if chance would
+hardly produce it (expected number of equally good accidents over all hypotheses below a limit) and if no other
+numbering explains the dots as well: a symmetric arrangement is refused, not guessed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import combinations, permutations
+
+import numpy as np
+from scipy import stats
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial import cKDTree
+
+from robcal.photogrammetry.core.bodies import Body, IntArray, line_ratio
+from robcal.photogrammetry.core.camera import Camera, normalise, project
+from robcal.photogrammetry.orientation.p3p import three_point_poses
+from robcal.photogrammetry.orientation.resection import refine_poses
+from robcal.transforms import Array, transform
+
+_CHANCE = 1e-3
+_SAME = 14.0
+"""Difference of chi-square below which two numberings cannot be told apart (odds of 1000 to 1)."""
+_BATCH = 20000
+_MORE_TRIPLES = 1
+"""Body triples tried beyond the first success, in search of rival numberings."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """One numbering of an image: ``rows`` of the dots, ``targets`` rows of the body, pose, cost and accidents."""
+
+    rows: IntArray
+    targets: IntArray
+    camera_T_body: Array
+    cost: float
+    expected_accidents: float
+
+
+def search_body(
+    camera: Camera,
+    xy: Array,
+    covariance: Array,
+    semi_major: Array,
+    body: Body,
+    candidates: IntArray,
+    *,
+    model_error_px: float,
+    max_hypotheses: int = 120_000,
+) -> tuple[list[Found], str]:
+    """Numberings of uncoded dots that geometry supports, the best first.
+
+    Parameters
+    ----------
+    xy, covariance, semi_major : (m, 2), (m, 2, 2), (m,) of the image's dots.
+    candidates : body rows that may appear (uncoded, with coordinates).
+    model_error_px : error the camera's start values cause.
+    max_hypotheses : three-point problems at most; triples of dots of similar size are tried first.
+
+    Returns
+    -------
+    Believable numberings (two or more: ambiguous) and, where there is none, the reason.
+    """
+    n, m = len(candidates), len(xy)
+    if n < 4:
+        return [], f"{n} uncoded targets with coordinates cannot be told apart by geometry; four or more are needed"
+    if m < 4:
+        return [], f"only {m} dots in the image"
+    if line_ratio(body.points[candidates]) < 0.02:
+        return [], "the targets lie in one line"
+    ideal = normalise(camera, xy)
+    tree = cKDTree(xy)
+    tolerance = 3.0 * model_error_px + 1.0
+    tried = 0
+    spare = _MORE_TRIPLES
+    found: list[Found] = []
+    why = "no arrangement of the dots fits the body"
+    for triple in _body_triples(body.points[candidates]):
+        base = candidates[list(triple)]
+        pool: list[tuple[float, Array]] = []
+        for dots in _dot_triples(semi_major, body.diameters[base]):
+            tried += len(dots)
+            points = np.broadcast_to(body.points[base], (len(dots), 3, 3))
+            poses = three_point_poses(ideal[dots], points)
+            poses = poses[_right_size(camera, poses, body.points[base], body.diameters[base], semi_major[dots])]
+            if len(poses):
+                pool += _best(camera, poses, xy, semi_major, tree, body, candidates, tolerance)
+        pool = sorted(pool, key=lambda item: item[0])[:60]
+        if pool:
+            more, why = _verify(camera, xy, covariance, body, candidates, pool, model_error_px, tried)
+            found += more
+        # any other numbering that fits as well has this triple elsewhere in the image: it would be in the pool, too
+        if any(len(f.rows) >= max(5, 0.6 * n) or len(f.rows) == n for f in found):
+            if spare == 0:
+                break
+            spare -= 1
+        if tried >= max_hypotheses:
+            break
+    return _unique(found, m, float(camera.width * camera.height)), why
+
+
+def _right_size(camera: Camera, poses: Array, points: Array, diameters: Array, semi_major: Array) -> Array:
+    """Mask (k, 4) of existing solutions whose distance agrees with the size of the three dots (where known)."""
+    exists = np.isfinite(poses[..., 0, 0])
+    if not np.isfinite(diameters).all():
+        return exists
+    z = np.einsum("ksj,nj->ksn", poses[..., 2, :3], points) + poses[..., 2, 3][..., None]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        size = camera.fx * 0.5 * diameters / z
+        fits = (semi_major[:, None] < 1.4 * size + 1.0) & (semi_major[:, None] > size / 1.4 - 1.0)
+    return exists & fits.all(axis=-1)
+
+
+def _body_triples(points: Array) -> Iterator[tuple[int, ...]]:
+    """Triples of targets, the widest triangles first, each new one sharing as little as possible with those before."""
+    n = len(points)
+    if n > 12:
+        rng = np.random.default_rng(0)
+        pool = [tuple(sorted(int(i) for i in rng.choice(n, 3, replace=False))) for _ in range(150)]
+    else:
+        pool = list(combinations(range(n), 3))
+    areas = {
+        t: float(np.linalg.norm(np.cross(points[t[1]] - points[t[0]], points[t[2]] - points[t[0]]))) for t in set(pool)
+    }
+    largest = max(areas.values())
+    left = [t for t in areas if areas[t] > 0.02 * largest]
+    used = np.zeros(n)
+    while left:
+        best = max(left, key=lambda t: areas[t] / largest - 2.0 * float(used[list(t)].sum()))
+        left.remove(best)
+        used[list(best)] += 1
+        yield best
+
+
+def _dot_triples(semi_major: Array, diameters: Array) -> Iterator[IntArray]:
+    """Ordered triples of dots in batches; where the targets' sizes are known, dots of unlike size are passed over."""
+    m = len(semi_major)
+    order = np.arange(m)
+    if m > 60:  # the sizes most common among the dots first
+        order = np.argsort(np.abs(np.log(semi_major / np.median(semi_major))), kind="stable")[:60]
+    known = np.isfinite(diameters).all()
+    batch: list[tuple[int, ...]] = []
+    for chosen in combinations(order, 3):
+        if known:
+            relative = semi_major[list(chosen)]
+            if relative.max() > 2.0 * relative.min() * diameters.max() / diameters.min():
+                continue
+        batch += permutations([int(i) for i in chosen])
+        if len(batch) >= _BATCH:
+            yield np.array(batch)
+            batch = []
+    if batch:
+        yield np.array(batch)
+
+
+def _best(
+    camera: Camera,
+    poses: Array,
+    xy: Array,
+    semi_major: Array,
+    tree: cKDTree,
+    body: Body,
+    candidates: IntArray,
+    tolerance: float,
+) -> list[tuple[float, Array]]:
+    p = transform(poses[:, None], body.points[candidates])
+    seen = project(camera, p)
+    ok = np.asarray(np.isfinite(seen).all(axis=-1))
+    distance, index = tree.query(np.where(ok[..., None], seen, -1e6), distance_upper_bound=tolerance)
+    size = camera.fx * 0.5 * body.diameters[candidates] / np.where(p[..., 2] > 0, p[..., 2], np.nan)
+    blob = semi_major[np.minimum(index, len(xy) - 1)]
+    with np.errstate(invalid="ignore"):
+        wrong = (blob > 1.7 * size + 1.0) | (blob < size / 1.7 - 1.0)
+    miss = np.where(np.isfinite(distance) & ~wrong, distance / tolerance, 1.0)
+    score = np.sum(miss**2, axis=1)
+    matched = np.sum(miss < 1.0, axis=1)
+    top = np.argsort(score, kind="stable")[:40]
+    return [(float(score[k]), poses[k]) for k in top if matched[k] >= 4]
+
+
+def match_dots(
+    predicted: Array, gate: Array, xy: Array, usable: Array | None = None, *, unique: bool = True
+) -> tuple[IntArray, IntArray]:
+    """One-to-one matches of predicted (n, 2) and measured (m, 2) dots within a radius ``gate`` (n,) px.
+
+    Parameters
+    ----------
+    usable : (n, m) mask of admissible matches. unique : leave a target out when a second dot lies in its gate, and a
+        dot when two targets claim it.
+
+    Returns
+    -------
+    Rows of the targets and of the dots.
+    """
+    d = np.linalg.norm(predicted[:, None] - xy[None], axis=-1)
+    inside = (d <= gate[:, None]) & np.isfinite(d)
+    if usable is not None:
+        inside &= usable
+    if unique:
+        good = inside & (inside.sum(axis=1) == 1)[:, None] & (inside.sum(axis=0) == 1)[None]
+        rows, columns = np.nonzero(good)
+        return rows, columns
+    cost = np.where(inside, d / gate[:, None], 10.0)
+    rows, columns = linear_sum_assignment(cost)
+    keep = inside[rows, columns]
+    return rows[keep], columns[keep]
+
+
+def _verify(
+    camera: Camera,
+    xy: Array,
+    covariance: Array,
+    body: Body,
+    candidates: IntArray,
+    pool: list[tuple[float, Array]],
+    model_error_px: float,
+    tried: int,
+) -> tuple[list[Found], str]:
+    """Refine the best hypotheses together, match again, and keep those that accidents would hardly produce."""
+    m, n = len(xy), len(candidates)
+    area = float(camera.width * camera.height)
+    C = covariance + model_error_px**2 * np.eye(2)
+    radius = np.full(n, 3.0 * model_error_px + 1.0)
+    poses = np.array([pose for _, pose in pool])
+    cost = np.zeros(len(poses))
+    matches: list[tuple[IntArray, IntArray]] = []
+    for _ in range(3):
+        predicted = project(camera, transform(poses[:, None], body.points[candidates]))
+        unique: dict[bytes, int] = {}
+        matches = []
+        for k, places in enumerate(predicted):
+            targets, rows = match_dots(places, radius, xy, unique=False)
+            key = np.stack([targets, rows]).tobytes()
+            enough = len(rows) >= 4 and line_ratio(body.points[candidates[targets]]) > 0.02
+            if enough and key not in unique:
+                unique[key] = k
+                matches.append((targets, rows))
+        if not matches:
+            return [], "no arrangement of the dots fits the body"
+        which = np.repeat(np.arange(len(matches)), [len(r) for _, r in matches])
+        targets = candidates[np.concatenate([t for t, _ in matches])]
+        rows = np.concatenate([r for _, r in matches])
+        fit = refine_poses(
+            poses[list(unique.values())],
+            which,
+            np.zeros(len(rows), dtype=np.int64),
+            [camera],
+            np.eye(4)[None],
+            body.points[targets],
+            xy[rows],
+            C[rows],
+            iterations=10,
+        )
+        poses, cost = fit.reference_T_body, fit.cost
+    found: list[Found] = []
+    why = "no arrangement of the dots fits the body"
+    for k, (own, rows) in enumerate(matches):
+        off = np.linalg.norm(project(camera, transform(poses[k], body.points[candidates[own]])) - xy[rows], axis=1)
+        reach = max(1.5 * float(np.sqrt(np.mean(off**2))), 0.5)
+        chance = min(1.0, m * np.pi * reach**2 / area)
+        # three matches are spent on the pose; a triple has two solutions in the mean
+        accidents = 2.0 * tried * float(stats.binom.sf(len(rows) - 4, n - 3, chance))
+        if accidents < _CHANCE:
+            found.append(Found(rows, candidates[own], poses[k], float(cost[k]), accidents))
+        else:
+            why = f"{len(rows)} of {n} targets fit, which {accidents:.2g} accidental arrangements would do as well"
+    return found, why
+
+
+def _unique(found: list[Found], m: int, area: float) -> list[Found]:
+    """Numberings that the best one does not clearly beat: by matched targets first, then by fit."""
+    if not found:
+        return []
+    merged: dict[bytes, Found] = {}
+    for f in found:
+        order = np.argsort(f.rows)
+        key = np.stack([f.rows[order], f.targets[order]]).tobytes()
+        if key not in merged or f.cost < merged[key].cost:
+            merged[key] = f
+    found = list(merged.values())
+    best = max(found, key=lambda f: (len(f.rows), -f.cost))
+    # a further matched dot is worth its odds against chance
+    odds = -2.0 * np.log(min(0.5, m * np.pi * 9.0 / area))
+    redundancy = max(1, 2 * len(best.rows) - 6)
+    variance = max(best.cost / redundancy, 1e-4)
+    score = {id(f): f.cost / variance - odds * len(f.rows) for f in found}
+    best = min(found, key=lambda f: score[id(f)])
+    out = [best]
+    own = dict(zip(best.rows.tolist(), best.targets.tolist(), strict=True))
+    for f in sorted(found, key=lambda f: score[id(f)]):
+        differs = any(own.get(int(r)) not in (None, int(t)) for r, t in zip(f.rows, f.targets, strict=True))
+        if f is not best and differs and score[id(f)] < score[id(best)] + _SAME:
+            out.append(f)
+    return out

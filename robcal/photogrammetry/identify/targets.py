@@ -1,0 +1,417 @@
+"""Which dot is which target: ring codes and markers first, then geometry, in one image of a station."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robcal.imaging.detections import Detections, TargetKind
+from robcal.photogrammetry.core.bodies import Body, IntArray
+from robcal.photogrammetry.core.camera import Camera, project_with_jacobians
+from robcal.photogrammetry.core.eccentric_circle import effective_point
+from robcal.photogrammetry.identify.grid import has_rows, search_grid
+from robcal.photogrammetry.identify.grow import View, view_of
+from robcal.photogrammetry.identify.search import match_dots, search_body
+from robcal.photogrammetry.orientation.resection import PoseFit, Resection, refine_poses, resect_images
+from robcal.transforms import Array, skew, transform
+
+_GATE = 5.0
+_CROWD = 100
+"""Dots in an image above which triples of dots are tried but briefly: they would not be enough in any time."""
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Where the body is expected before the camera: ``camera_T_body`` (4, 4), ``covariance`` (6, 6) or None and the
+    error in the image (px) beyond that covariance."""
+
+    camera_T_body: Array
+    covariance: Array | None = None
+    error_px: float = 3.0
+
+
+@dataclass(frozen=True)
+class IdentifiedImage:
+    """Targets identified in one image.
+
+    Attributes
+    ----------
+    rows : (k,) rows of the detections; ids : (k,) target ids.
+    camera_T_body : pose found on the way, None where only codes were read.
+    method : 'codes', 'prediction', 'search', 'rows' (search by rows of dots) or 'none'.
+    alternatives : other poses (with other numberings) that fit as well; then nothing is identified.
+    reason : why nothing was identified, else empty.
+    view : where rows of dots were identified, what this camera sees, as evidence for others.
+    """
+
+    rows: IntArray
+    ids: IntArray
+    camera_T_body: Array | None
+    method: str
+    alternatives: tuple[Array, ...] = ()
+    reason: str = ""
+    view: View | None = None
+
+
+def identify_targets(
+    detections: Detections,
+    body: Body,
+    camera: Camera,
+    *,
+    predictions: Sequence[Prediction] = (),
+    model_error_px: float = 3.0,
+    search: bool = True,
+    others: Sequence[View] = (),
+) -> IdentifiedImage:
+    """Identify the targets of a body in one image.
+
+    Codes give ids at once; with four or more of known coordinates they also give a pose, which removes misread codes
+    and predicts the uncoded and unread dots. Without enough codes a prediction (from another camera or the last pose)
+    is tried, then a search by geometry.
+
+    Parameters
+    ----------
+    predictions : expected poses, each tried; the one that explains most dots wins.
+    model_error_px : error in the image that the camera's start values may cause.
+    search : allow the search without prediction (refused where the numbering is not unique).
+    others : what other cameras see of the body at this moment (by rows of its uncoded targets with coordinates); they
+        may decide between numberings of a regular body.
+    """
+    return identify_images(
+        [detections],
+        body,
+        camera,
+        predictions=[predictions],
+        model_error_px=model_error_px,
+        search=search,
+        others=others,
+    )[0]
+
+
+def identify_images(
+    images: Sequence[Detections],
+    body: Body,
+    camera: Camera,
+    *,
+    predictions: Sequence[Sequence[Prediction]] | None = None,
+    model_error_px: float = 3.0,
+    search: bool = True,
+    others: Sequence[View] = (),
+) -> list[IdentifiedImage]:
+    """Identify the targets in many images of one camera: as :func:`identify_targets` does, many poses at once.
+
+    ``predictions`` per image, None for none.
+    """
+    expected = [()] * len(images) if predictions is None else predictions
+    coded = [coded_rows(detections, body) for detections in images]
+    placed = [body.known[body.index(ids)] if len(ids) else np.zeros(0, dtype=bool) for _, ids in coded]
+    tasks: list[tuple[int, _Start]] = []
+    for k, fit in _resected(images, coded, placed, body, camera, model_error_px).items():
+        if fit.inliers.sum() >= 4 and fit.chi2 < 50.0 * max(1, fit.redundancy):
+            keep = np.ones(len(coded[k][0]), dtype=bool)
+            keep[np.flatnonzero(placed[k])[~fit.inliers]] = False
+            prediction = Prediction(fit.camera_T_body, fit.covariance, model_error_px)
+            tasks.append((k, _Start(images[k], coded[k][0][keep], coded[k][1][keep], prediction, "codes")))
+    out: list[IdentifiedImage | None] = [None] * len(images)
+    for (k, _), image in zip(tasks, _extended(body, camera, [start for _, start in tasks]), strict=True):
+        out[k] = image
+    return [
+        image
+        if image is not None
+        else _without_codes(images[k], body, camera, coded[k], expected[k], model_error_px, search, others)
+        for k, image in enumerate(out)
+    ]
+
+
+def _resected(
+    images: Sequence[Detections],
+    coded: Sequence[tuple[IntArray, IntArray]],
+    placed: Sequence[NDArray[np.bool_]],
+    body: Body,
+    camera: Camera,
+    model_error_px: float,
+) -> dict[int, Resection]:
+    """Poses of the images with four or more coded targets of known place, by number of the image; ``inliers`` count
+    the image's own ``placed`` codes."""
+    several = [k for k, mask in enumerate(placed) if mask.sum() >= 4]
+    if not several:
+        return {}
+    rows = [coded[k][0][placed[k]] for k in several]
+    number = np.repeat(np.arange(len(several)), [len(own) for own in rows])
+    ids = np.concatenate([coded[k][1][placed[k]] for k in several])
+    xy = np.concatenate([images[k].xy[own] for k, own in zip(several, rows, strict=True)])
+    covariance = np.concatenate([images[k].covariance[own] for k, own in zip(several, rows, strict=True)])
+    found = resect_images(camera, number, ids, xy, covariance, body, model_error_px=model_error_px)
+    return {
+        k: replace(fit, inliers=fit.inliers[number == i])
+        for i, (k, fit) in enumerate(zip(several, found, strict=True))
+        if isinstance(fit, Resection)
+    }
+
+
+def _without_codes(
+    detections: Detections,
+    body: Body,
+    camera: Camera,
+    coded: tuple[IntArray, IntArray],
+    predictions: Sequence[Prediction],
+    model_error_px: float,
+    search: bool,
+    others: Sequence[View],
+) -> IdentifiedImage:
+    """One image whose codes give no pose: by predictions, then by its geometry."""
+    rows, ids = coded
+    placed = body.known[body.index(ids)] if len(ids) else np.zeros(0, dtype=bool)
+    best: IdentifiedImage | None = None
+    starts = [_Start(detections, rows, ids, prediction, "prediction") for prediction in predictions]
+    for trial in _extended(body, camera, starts):
+        if len(trial.rows) >= 4 and (best is None or len(trial.rows) > len(best.rows)):
+            best = trial
+    if best is not None:
+        return best
+    none = np.empty(0, dtype=np.int64)
+    dots = _free_dots(detections, rows)
+    candidates = np.flatnonzero(body.known & ~np.isin(body.ids, ids) & _uncoded(body))
+    reason = f"{len(ids)} coded targets read, too few for a pose"
+    if search and len(candidates) >= 4:
+        if has_rows(body.points[candidates]) and len(dots) > len(candidates) // 2:
+            grid = _from_rows(detections, body, camera, candidates, dots, model_error_px, others)
+            if grid.method != "none" or grid.alternatives:
+                return _joined(rows, ids, grid)
+        found, why = search_body(
+            camera,
+            detections.xy[dots],
+            detections.covariance[dots],
+            detections.semi_axes[dots, 0],
+            body,
+            candidates,
+            model_error_px=model_error_px,
+            max_hypotheses=120_000 if len(dots) <= _CROWD else 30_000,
+        )
+        if len(found) == 1:
+            single = IdentifiedImage(dots[found[0].rows], body.ids[found[0].targets], found[0].camera_T_body, "search")
+            return _joined(rows, ids, single)
+        if len(found) > 1:
+            return IdentifiedImage(
+                none, none, None, "none", tuple(f.camera_T_body for f in found), _symmetric(len(found))
+            )
+        reason = why
+    if len(rows):
+        return IdentifiedImage(rows, ids, None, "codes", (), reason if placed.sum() < 3 else "")
+    return IdentifiedImage(none, none, None, "none", (), reason)
+
+
+def _symmetric(numberings: int) -> str:
+    return (
+        f"{numberings} numberings of the dots fit equally well (the arrangement is symmetric): "
+        "use coded targets or a second camera"
+    )
+
+
+def _joined(rows: IntArray, ids: IntArray, found: IdentifiedImage) -> IdentifiedImage:
+    """A result of the search with the coded targets that were read."""
+    if found.method == "none":
+        return found
+    return replace(found, rows=np.concatenate([rows, found.rows]), ids=np.concatenate([ids, found.ids]))
+
+
+def _from_rows(
+    detections: Detections,
+    body: Body,
+    camera: Camera,
+    candidates: IntArray,
+    dots: IntArray,
+    model_error_px: float,
+    others: Sequence[View],
+) -> IdentifiedImage:
+    """The search by rows of dots: one numbering, several (refused), or nothing with a reason."""
+    size = np.sqrt(detections.semi_axes[dots].prod(axis=1))
+    found, why = search_grid(
+        camera,
+        detections.xy[dots],
+        size,
+        detections.contrast[dots],
+        body,
+        candidates,
+        model_error_px=model_error_px,
+        others=others,
+    )
+    none = np.empty(0, dtype=np.int64)
+    if len(found) != 1:
+        poses = tuple(f.camera_T_body for f in found)
+        return IdentifiedImage(none, none, None, "none", poses, _symmetric(len(found)) if found else why)
+    best = found[0]
+    rows, targets = dots[best.dots], candidates[best.targets]
+    zero = np.zeros(len(rows), dtype=np.int64)
+    covariance = detections.covariance[rows] + best.rms**2 * np.eye(2)
+    # the pose that belongs to the camera as given, not to the lens adjusted on the way
+    fit = refine_poses(
+        best.camera_T_body[None],
+        zero,
+        zero,
+        [camera],
+        np.eye(4)[None],
+        body.points[targets],
+        detections.xy[rows],
+        covariance,
+    )
+    view = view_of(best, body.points[candidates])
+    return IdentifiedImage(rows, body.ids[targets], fit.reference_T_body[0], "rows", view=view)
+
+
+def _uncoded(body: Body) -> NDArray[np.bool_]:
+    return np.array([code is None for code in body.codes], dtype=bool)
+
+
+def coded_rows(detections: Detections, body: Body) -> tuple[IntArray, IntArray]:
+    """Rows and ids of dots whose code belongs to the body; a code seen twice is no identification."""
+    ring = np.array([c == "ring12" for c in body.codes], dtype=bool)
+    marker = np.array([c is not None and c.startswith("aruco") for c in body.codes], dtype=bool)
+    code = detections.code
+    ok = np.zeros(len(code), dtype=bool)
+    ok |= (detections.kind == TargetKind.RING12) & np.isin(code, body.ids[ring])
+    ok |= (detections.kind == TargetKind.ARUCO) & np.isin(code, body.ids[marker])
+    values, counts = np.unique(code[ok], return_counts=True)
+    ok &= ~np.isin(code, values[counts > 1])
+    rows = np.flatnonzero(ok)
+    return rows, code[rows].astype(np.int64)
+
+
+def _free_dots(detections: Detections, used: IntArray) -> IntArray:
+    free = detections.kind == TargetKind.DOT
+    free |= (detections.kind == TargetKind.RING12) & (detections.code < 0)
+    free[used] = False
+    return np.flatnonzero(free)
+
+
+@dataclass(frozen=True)
+class _Start:
+    """An image with the dots identified by code and where its body is expected."""
+
+    detections: Detections
+    rows: IntArray
+    ids: IntArray
+    prediction: Prediction
+    method: str
+
+
+class _Growth:
+    """One image between two rounds: the pose as known, and what it explains."""
+
+    def __init__(self, start: _Start, body: Body) -> None:
+        self.start = start
+        self.pose, self.covariance = start.prediction.camera_T_body, start.prediction.covariance
+        self.error = start.prediction.error_px
+        self.rows, self.ids = start.rows, start.ids
+        self.others = np.flatnonzero(body.known & ~np.isin(body.ids, start.ids))
+        # a code that was seen twice or unreadable is a dot like the others
+        dots = np.setdiff1d(np.arange(len(start.detections.xy)), start.rows)
+        self.dots = dots[start.detections.kind[dots] != TargetKind.ARUCO]
+        self.done = len(self.others) == 0 and len(start.rows) > 0
+        self._before: tuple[int, ...] | None = None
+
+    def match(self, body: Body, camera: Camera) -> tuple[IntArray, IntArray] | None:
+        """Rows and ids that the pose explains; None where nothing is to be refined any more."""
+        d = self.start.detections
+        predicted, gate, size = predict_dots(camera, self.pose, self.covariance, body, self.others, self.error)
+        blob, readable = d.semi_axes[self.dots, 0], d.code[self.dots]
+        with np.errstate(invalid="ignore"):
+            like = ~((blob[None] > 1.6 * size[:, None] + 1.0) | (blob[None] < size[:, None] / 1.6 - 1.0))
+        # a dot that carries another valid code of this body is not an uncoded target
+        other_code = np.isin(readable, body.ids) & (readable >= 0)
+        like &= ~other_code[None] | (readable[None] == body.ids[self.others][:, None])
+        targets, found = match_dots(predicted, gate, d.xy[self.dots], like)
+        rows = np.concatenate([self.start.rows, self.dots[found]])
+        ids = np.concatenate([self.start.ids, body.ids[self.others[targets]]])
+        now = (*rows.tolist(), *ids.tolist())
+        if now == self._before:
+            self.done = True
+            return None
+        self._before = now
+        if (body.known[body.index(ids)].sum() if len(ids) else 0) < 4:
+            self.rows, self.ids, self.done = rows, ids, True
+            return None
+        return rows, ids
+
+    def take(self, rows: IntArray, ids: IntArray, fit: PoseFit, k: int) -> None:
+        """The refined pose and its matches; nothing if the pose is singular."""
+        if not np.isfinite(fit.covariance[k]).all():
+            self.done = True
+            return
+        spread = float(np.sqrt(fit.cost[k] / max(1, fit.redundancy[k])))
+        self.pose, self.covariance = fit.reference_T_body[k], fit.covariance[k] * max(1.0, spread) ** 2
+        self.error = float(np.clip(self.error * spread, 0.1, self.error))
+        self.rows, self.ids = rows, ids
+
+
+def _extended(body: Body, camera: Camera, starts: Sequence[_Start]) -> list[IdentifiedImage]:
+    """Add the dots that the poses predict, refine all poses, and look again with the smaller uncertainties."""
+    images = [_Growth(start, body) for start in starts]
+    normals = body.estimated_normals()
+    for _ in range(3):
+        matched = [(g, found) for g in images if not g.done and (found := g.match(body, camera)) is not None]
+        if not matched:
+            break
+        usable = [body.known[body.index(ids)] for _, (_, ids) in matched]
+        pose = np.repeat(np.arange(len(matched)), [int(mask.sum()) for mask in usable])
+        at = np.concatenate([body.index(ids[mask]) for (_, (_, ids)), mask in zip(matched, usable, strict=True)])
+        xy, covariance = [], []
+        for (g, (rows, _)), mask in zip(matched, usable, strict=True):
+            xy.append(g.start.detections.xy[rows[mask]])
+            covariance.append(g.start.detections.covariance[rows[mask]] + g.error**2 * np.eye(2))
+        fit = refine_poses(
+            np.array([g.pose for g, _ in matched]),
+            pose,
+            np.zeros(len(pose), dtype=np.int64),
+            [camera],
+            np.eye(4)[None],
+            body.points[at],
+            np.concatenate(xy),
+            np.concatenate(covariance),
+            radius=0.5 * body.diameters[at],
+            normals=normals[at],
+        )
+        for k, (g, (rows, ids)) in enumerate(matched):
+            g.take(rows, ids, fit, k)
+    return [IdentifiedImage(g.rows, g.ids, g.pose, g.start.method) for g in images]
+
+
+_INSIDE_RING = 1.2
+"""Search radius of a dot within a code ring by its radius: parts of the ring lie from two radii on, less if tilted."""
+_LEAST_GATE = 3.0
+"""px"""
+
+
+def predict_dots(
+    camera: Camera, pose: Array, covariance: Array | None, body: Body, targets: IntArray, error_px: float
+) -> tuple[Array, Array, Array]:
+    """Where a pose puts targets in the image.
+
+    Returns
+    -------
+    Places (n, 2) px, NaN where they cannot be seen; search radii (n,) px; expected semi-axes (n,) px, NaN where the
+    diameter is not known.
+    """
+    X = body.points[targets]
+    normals = body.estimated_normals()[targets] @ pose[:3, :3].T
+    p = transform(pose, X)
+    xy, d_point, _ = project_with_jacobians(camera, effective_point(p, normals, 0.5 * body.diameters[targets]))
+    variance = np.full(len(targets), error_px**2)
+    if covariance is not None:
+        J = d_point @ np.concatenate([np.broadcast_to(pose[:3, :3], (len(X), 3, 3)), -pose[:3, :3] @ skew(X)], axis=-1)
+        S = J @ covariance @ np.swapaxes(J, -1, -2)
+        variance = variance + np.linalg.eigvalsh(0.5 * (S + np.swapaxes(S, -1, -2)))[..., -1]
+    inside = (xy > -20).all(axis=1) & (xy[:, 0] < camera.width + 20) & (xy[:, 1] < camera.height + 20)
+    if body.normals is not None:
+        facing = np.sum(normals * p, axis=1) < 0
+        inside &= facing | ~np.isfinite(normals).all(axis=1)
+    xy = np.where(inside[:, None], xy, np.nan)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        size = camera.fx * 0.5 * body.diameters[targets] / p[:, 2]
+    gate = np.where(np.isfinite(variance), _GATE * np.sqrt(np.maximum(variance, 0.01)), 0.0)
+    ringed = np.array([code == "ring12" for code in body.codes], dtype=bool)[targets] & np.isfinite(size)
+    gate = np.where(ringed, np.minimum(gate, np.maximum(_INSIDE_RING * size, _LEAST_GATE)), gate)
+    return xy, gate, size

@@ -1,0 +1,1 @@
+"""Points and frames of the measuring body in the world, with covariance."""

@@ -1,0 +1,1 @@
+"""Resection, relative and planar start orientations, forward intersection."""

@@ -1,0 +1,409 @@
+"""Spatial resection: the pose of a known body from one image (or from several cameras at once), many images together.
+
+Closed form for the start (IPPE for planes, SQPnP otherwise, three-point search where marks are misidentified), then
+least squares with the marks' covariances. A plane seen by one camera has two poses of similar fit; both are returned.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from robcal.errors import DegenerateGeometry, InvalidInput
+from robcal.photogrammetry.core.bodies import Body, IntArray, line_ratio, thickness_ratio
+from robcal.photogrammetry.core.camera import Camera, normalise, project, project_with_jacobians
+from robcal.photogrammetry.core.eccentric_circle import effective_point
+from robcal.photogrammetry.core.grouping import sum_by, whitener
+from robcal.photogrammetry.orientation.p3p import three_point_poses
+from robcal.transforms import Array, frame, invert, retract, skew, transform
+
+_LINE = 0.01
+"""Targets whose spread across their line is below this share of its length carry no pose."""
+
+
+@dataclass(frozen=True)
+class PoseFit:
+    """Least-squares poses of ``k`` images (or of ``k`` bodies seen by several cameras).
+
+    ``reference_T_body`` (k, 4, 4), ``covariance`` (k, 6, 6) from the marks' covariances (right perturbation), NaN where
+    singular; ``cost`` (k,) sum of squared whitened residuals; ``count`` (k,) marks; ``whitened`` (m, 2) residuals.
+    """
+
+    reference_T_body: Array
+    covariance: Array
+    cost: Array
+    count: IntArray
+    whitened: Array
+
+    @property
+    def redundancy(self) -> IntArray:
+        """2 * marks - 6, per pose."""
+        return 2 * self.count - 6
+
+
+@dataclass(frozen=True)
+class Resection:
+    """Pose of a body before one camera.
+
+    Attributes
+    ----------
+    camera_T_body : (4, 4), the better solution; ``covariance`` (6, 6) from the marks' covariances.
+    alternative : (4, 4) the other solution of a plane, None if there is none near.
+    ambiguous : the data do not tell the two solutions apart (chi-square difference below 14, odds of 1000 to 1).
+    chi2, redundancy : of the better solution; ``chi2_alternative`` of the other (inf without).
+    inliers : (m,) marks that fit.
+    """
+
+    camera_T_body: Array
+    covariance: Array
+    alternative: Array | None
+    ambiguous: bool
+    chi2: float
+    redundancy: int
+    chi2_alternative: float
+    inliers: NDArray[np.bool_]
+
+
+def refine_poses(
+    reference_T_body: Array,
+    pose: IntArray,
+    camera: IntArray,
+    cameras: Sequence[Camera],
+    reference_T_camera: Array,
+    points: Array,
+    xy: Array,
+    covariance: Array,
+    *,
+    radius: Array | None = None,
+    normals: Array | None = None,
+    iterations: int = 12,
+) -> PoseFit:
+    """Poses of a body by least squares, one 6 x 6 system per pose, all poses at once (Levenberg damping per pose).
+
+    Parameters
+    ----------
+    reference_T_body : (k, 4, 4) start values.
+    pose, camera : (m,) which pose and which camera each mark belongs to.
+    cameras : the cameras; reference_T_camera (c, 4, 4) their fixed exterior orientations.
+    points : (m, 3) m body coordinates of each mark's target; xy (m, 2) px, covariance (m, 2, 2) px^2.
+    radius, normals : (m,), (m, 3) of circular targets, for the eccentricity of their images.
+    """
+    T = np.array(reference_T_body, dtype=float)
+    k = len(T)
+    W = whitener(covariance)
+    camera_T_reference = invert(reference_T_camera)
+    count = np.bincount(pose, minlength=k).astype(np.int64)
+
+    def residuals(poses: Array) -> tuple[Array, Array]:
+        camera_T_body = (camera_T_reference[camera] @ poses[pose]) if len(pose) else np.empty((0, 4, 4))
+        p_camera = transform(camera_T_body, points)
+        if radius is not None and normals is not None:
+            turned = np.einsum("mij,mj->mi", camera_T_body[:, :3, :3], normals)
+            p_camera = effective_point(p_camera, turned, radius)
+        r = np.empty((len(pose), 2))
+        J = np.empty((len(pose), 2, 6))
+        R = camera_T_body[:, :3, :3]
+        by_pose = np.concatenate([R, -R @ skew(points)], axis=-1)
+        for c, cam in enumerate(cameras):
+            rows = camera == c
+            value, d_point, _ = project_with_jacobians(cam, p_camera[rows])
+            r[rows] = xy[rows] - value
+            J[rows] = d_point @ by_pose[rows]
+        return np.einsum("mij,mj->mi", W, r), W @ J
+
+    def cost_of(r: Array) -> Array:
+        value = sum_by(pose, np.sum(r**2, axis=1), k)
+        return np.where(np.isfinite(value), value, np.inf)
+
+    damping = np.full(k, 1e-6)
+    r, J = residuals(T)
+    cost = cost_of(r)
+    for _ in range(iterations):
+        clean = np.where(np.isfinite(J), J, 0.0)
+        N = sum_by(pose, np.swapaxes(clean, -1, -2) @ clean, k)
+        g = sum_by(pose, np.einsum("mij,mi->mj", clean, np.where(np.isfinite(r), r, 0.0)), k)
+        diagonal = np.einsum("kii->ki", N)
+        floor = 1e-12 * diagonal.max(axis=1, keepdims=True) + 1e-30
+        damped = N + (damping[:, None] * diagonal + floor)[:, :, None] * np.eye(6)
+        step = np.linalg.solve(damped, g[..., None])[..., 0]
+        length = np.linalg.norm(step[:, 3:], axis=1)
+        step *= np.minimum(1.0, 0.5 / np.maximum(length, 1e-300))[:, None]
+        trial = retract(T, step)
+        r_new, J_new = residuals(trial)
+        cost_new = cost_of(r_new)
+        better = cost_new <= cost
+        T = np.where(better[:, None, None], trial, T)
+        gain = np.where(better, cost - cost_new, np.inf)
+        damping = np.where(better, damping * 0.1, np.maximum(damping, 1e-4) * 10)
+        rows = better[pose]
+        r = np.where(rows[:, None], r_new, r)
+        J = np.where(rows[:, None, None], J_new, J)
+        cost = np.where(better, cost_new, cost)
+        if np.all((gain <= 1e-8 * (1e-6 + cost)) | (damping > 1e6)):
+            break
+    clean = np.where(np.isfinite(J), J, 0.0)
+    N = sum_by(pose, np.swapaxes(clean, -1, -2) @ clean, k)
+    scale = np.sqrt(np.maximum(np.einsum("kii->ki", N), 1e-300))
+    unit = N / (scale[:, :, None] * scale[:, None, :])
+    values = np.linalg.eigvalsh(unit)
+    regular = (values[:, 0] > 1e-12) & (count >= 3)
+    C = np.full((k, 6, 6), np.nan)
+    if regular.any():
+        C[regular] = np.linalg.inv(unit[regular]) / (scale[regular, :, None] * scale[regular, None, :])
+    return PoseFit(T, C, cost, count, r)
+
+
+def start_poses(camera: Camera, xy: Array, points: Array) -> list[Array]:
+    """Closed-form poses camera_T_body of at least three marks, the likelier first; empty where none exists.
+
+    Raises
+    ------
+    DegenerateGeometry : fewer than three marks, or all in one line.
+    """
+    if len(points) < 3:
+        raise DegenerateGeometry(f"a resection needs at least three targets in the image, got {len(points)}")
+    if line_ratio(points) < _LINE:
+        raise DegenerateGeometry("the targets seen lie in one line: their image does not fix a pose")
+    ideal = normalise(camera, xy)
+    use = np.isfinite(ideal).all(axis=1)
+    if use.sum() < 3:
+        return []
+    ideal, object_points = ideal[use], np.ascontiguousarray(points[use])
+    if len(ideal) == 3:
+        return [T for T in three_point_poses(ideal[None], object_points[None])[0] if np.isfinite(T).all()]
+    flat = thickness_ratio(object_points) < 0.02
+    found: list[Array] = []
+    methods = [cv2.SOLVEPNP_IPPE, cv2.SOLVEPNP_SQPNP] if flat else [cv2.SOLVEPNP_SQPNP]
+    for method in methods:
+        try:
+            _, rotations, translations, _ = cv2.solvePnPGeneric(
+                object_points, np.ascontiguousarray(ideal[:, None]), np.eye(3), None, flags=method
+            )
+        except cv2.error:  # degenerate for this solver; the other one or the three-point search may still do
+            continue
+        for rotation, translation in zip(rotations, translations, strict=True):
+            T = frame(cv2.Rodrigues(rotation)[0], np.ravel(translation))
+            if np.isfinite(T).all() and np.all(transform(T, object_points)[:, 2] > 0):
+                found.append(T)
+        if flat and len(found) >= 2:
+            break
+    return found
+
+
+def robust_start(
+    camera: Camera, xy: Array, points: Array, *, tolerance_px: float, seed: int = 1, triples: int = 300
+) -> tuple[Array | None, NDArray[np.bool_]]:
+    """Pose that most marks agree with, although some are misidentified: three-point solutions, counted inliers.
+
+    Returns the pose (None where no triple works) and the mask of marks within ``tolerance_px`` of it.
+    """
+    ideal = normalise(camera, xy)
+    usable = np.flatnonzero(np.isfinite(ideal).all(axis=1))
+    none = np.zeros(len(xy), dtype=bool)
+    if len(usable) < 3:
+        return None, none
+    if len(usable) <= 13:
+        chosen = np.array(list(combinations(usable, 3)))
+    else:
+        rng = np.random.default_rng(seed)
+        chosen = np.array([rng.choice(usable, 3, replace=False) for _ in range(triples)])
+    poses = three_point_poses(ideal[chosen], points[chosen]).reshape(-1, 4, 4)
+    poses = poses[np.isfinite(poses[:, 0, 0])]
+    if len(poses) == 0:
+        return None, none
+    miss = np.linalg.norm(project(camera, transform(poses[:, None], points)) - xy, axis=-1)
+    miss = np.where(np.isfinite(miss), miss, np.inf)
+    score = np.sum(np.minimum(miss / tolerance_px, 1.0) ** 2, axis=1)
+    best = int(np.argmin(score))
+    return poses[best], miss[best] < tolerance_px
+
+
+def resect(
+    camera: Camera,
+    ids: Sequence[int] | IntArray,
+    xy: Array,
+    covariance: Array,
+    body: Body,
+    *,
+    gate: float = 4.0,
+    model_error_px: float = 0.0,
+) -> Resection:
+    """Pose of a body from the marks of one image; see :func:`resect_images`.
+
+    Raises
+    ------
+    DegenerateGeometry : fewer than three marks of known targets, in one line, or no pose that three of them agree on.
+    InvalidInput : a mark of a target that the body does not have.
+    """
+    image = np.zeros(len(xy), dtype=np.int64)
+    result = resect_images(camera, image, ids, xy, covariance, body, gate=gate, model_error_px=model_error_px)[0]
+    if isinstance(result, DegenerateGeometry):
+        raise result
+    return result
+
+
+def resect_images(
+    camera: Camera,
+    image: IntArray,
+    ids: Sequence[int] | IntArray,
+    xy: Array,
+    covariance: Array,
+    body: Body,
+    *,
+    gate: float = 4.0,
+    model_error_px: float = 0.0,
+) -> list[Resection | DegenerateGeometry]:
+    """Poses of a body from many images of one camera, misidentified marks left out.
+
+    Parameters
+    ----------
+    image : (m,) number of each mark's image, 0 .. k-1.
+    ids, xy, covariance : (m,), (m, 2) px, (m, 2, 2) px^2 of the marks; ids must belong to the body.
+    gate : marks further off than this many standard deviations are outliers.
+    model_error_px : what the camera's start values may be wrong by, added to the marks' covariance.
+
+    Returns
+    -------
+    One entry per image: the resection, or the error that says why there is none.
+
+    Raises
+    ------
+    InvalidInput : a mark of a target that the body does not have.
+    """
+    at = body.index(ids)
+    if np.any(at < 0):
+        raise InvalidInput(f"body {body.name} has no target {np.asarray(ids)[at < 0][0]}")
+    k = int(image.max()) + 1 if len(image) else 0
+    keep = body.known[at]
+    C = np.asarray(covariance, dtype=float) + model_error_px**2 * np.eye(2)
+    data = _Marks(
+        camera, body.points[at], np.asarray(xy, dtype=float), C, 0.5 * body.diameters[at], body.estimated_normals()[at]
+    )
+    rows_of = [np.flatnonzero(keep & (image == i)) for i in range(k)]
+    failed: dict[int, DegenerateGeometry] = {}
+    tasks: list[tuple[int, Array, IntArray]] = []
+    for i, rows in enumerate(rows_of):
+        try:
+            starts = start_poses(camera, data.xy[rows], data.points[rows])
+        except DegenerateGeometry as error:
+            failed[i] = error
+            continue
+        tasks += [(i, T, rows) for T in starts]
+    solutions = _refine_tasks(data, tasks, k)
+    again: list[tuple[int, Array, IntArray]] = []
+    inside = dict(enumerate(rows_of))
+    for i, rows in enumerate(rows_of):
+        m = len(rows)
+        if i in failed or m <= 3:
+            continue
+        limit = 2 * m - 6 + gate * np.sqrt(2 * (2 * m - 6) + 1)
+        if solutions[i] and solutions[i][0].cost <= max(limit, gate**2):
+            continue
+        found = _without_outliers(data, rows, gate)
+        if found is not None:
+            pose, inside[i] = found
+            again.append((i, pose, inside[i]))
+            if line_ratio(data.points[inside[i]]) > _LINE:
+                again += [(i, T, inside[i]) for T in start_poses(camera, data.xy[inside[i]], data.points[inside[i]])]
+        # else: no consistent subset of four; the fit to all marks stands, with its large chi-square
+    for i, better in enumerate(_refine_tasks(data, again, k)):
+        if better:
+            solutions[i] = better
+    out: list[Resection | DegenerateGeometry] = []
+    for i in range(k):
+        if i in failed or not solutions[i]:
+            reason = failed.get(i)
+            text = "no pose agrees with the targets of the image: wrong ids, another body or a wrong camera file"
+            out.append(reason if reason is not None else DegenerateGeometry(text))
+            continue
+        out.append(_choose(solutions[i], inside[i], len(xy)))
+    return out
+
+
+@dataclass(frozen=True)
+class _Marks:
+    camera: Camera
+    points: Array
+    xy: Array
+    covariance: Array
+    radius: Array
+    normals: Array
+
+
+@dataclass(frozen=True)
+class _Solution:
+    pose: Array
+    covariance: Array
+    cost: float
+
+
+def _refine_tasks(data: _Marks, tasks: list[tuple[int, Array, IntArray]], k: int) -> list[list[_Solution]]:
+    """Least-squares poses of (image, start pose, rows), sorted by cost, per image."""
+    solutions: list[list[_Solution]] = [[] for _ in range(k)]
+    if not tasks:
+        return solutions
+    rows = np.concatenate([task[2] for task in tasks])
+    which = np.repeat(np.arange(len(tasks)), [len(task[2]) for task in tasks])
+    fit = refine_poses(
+        np.array([task[1] for task in tasks]),
+        which,
+        np.zeros(len(rows), dtype=np.int64),
+        [data.camera],
+        np.eye(4)[None],
+        data.points[rows],
+        data.xy[rows],
+        data.covariance[rows],
+        radius=data.radius[rows],
+        normals=data.normals[rows],
+        iterations=25,
+    )
+    for j, (i, _, _) in enumerate(tasks):
+        if np.isfinite(fit.cost[j]):
+            solutions[i].append(_Solution(fit.reference_T_body[j], fit.covariance[j], float(fit.cost[j])))
+    return [sorted(found, key=lambda s: s.cost) for found in solutions]
+
+
+def _without_outliers(data: _Marks, rows: IntArray, gate: float) -> tuple[Array, IntArray] | None:
+    """Pose and rows of the marks that agree with it (at least four), by three-point search and re-selection."""
+    sigma = float(np.sqrt(np.median(np.einsum("mii->m", data.covariance[rows])) / 2))
+    pose, near = robust_start(data.camera, data.xy[rows], data.points[rows], tolerance_px=3 * gate * sigma)
+    if pose is None or near.sum() < 4:
+        return None
+    for _ in range(4):
+        fit = _refine_tasks(data, [(0, pose, rows[near])], 1)[0]
+        if not fit:
+            return None
+        pose = fit[0].pose
+        again = np.linalg.norm(_whiten(data, pose, rows), axis=1) < gate + 1
+        if again.sum() < 4 or np.array_equal(again, near):
+            break
+        near = again
+    return pose, rows[near]
+
+
+def _choose(solutions: list[_Solution], rows: IntArray, marks: int) -> Resection:
+    best = solutions[0]
+    other: Array | None = None
+    cost_other = np.inf
+    for candidate in solutions[1:]:
+        if np.trace(best.pose[:3, :3].T @ candidate.pose[:3, :3]) < 3 - 1e-4:
+            other, cost_other = candidate.pose, candidate.cost
+            break
+    mask = np.zeros(marks, dtype=bool)
+    mask[rows] = True
+    redundancy = 2 * len(rows) - 6
+    variance = max(1.0, best.cost / redundancy) if redundancy > 0 else 1.0
+    ambiguous = other is not None and cost_other - best.cost < 14 * variance
+    return Resection(best.pose, best.covariance, other, ambiguous, best.cost, redundancy, cost_other, mask)
+
+
+def _whiten(data: _Marks, camera_T_body: Array, rows: IntArray) -> Array:
+    normals = data.normals[rows] @ camera_T_body[:3, :3].T
+    p = effective_point(transform(camera_T_body, data.points[rows]), normals, data.radius[rows])
+    off = np.einsum("mij,mj->mi", whitener(data.covariance[rows]), data.xy[rows] - project(data.camera, p))
+    return np.where(np.isfinite(off), off, np.inf)

@@ -1,0 +1,1 @@
+"""Cameras that watch the robot: identification, start, adjustment, cleaning."""

@@ -1,0 +1,403 @@
+"""Least-squares adjustment of a station: all cameras, all poses and the body together.
+
+Gauss-Newton with step halving. The body poses are eliminated from the normal equations (Schur complement), so the
+system to solve has only the unknowns of cameras and body, however many poses there are. Source of the elimination:
+Triggs, McLauchlan, Hartley, Fitzgibbon (2000), "Bundle adjustment: a modern synthesis", section 6.1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
+
+from robcal.errors import NotIdentifiable
+from robcal.photogrammetry.core.camera import INTRINSIC_NAMES, Camera, project_with_jacobians
+from robcal.photogrammetry.core.eccentric_circle import effective_point
+from robcal.photogrammetry.core.grouping import sum_by, whitener
+from robcal.photogrammetry.station.network import MarkTable, StationDesign, Unknowns
+from robcal.transforms import Array, invert, retract, skew
+
+
+def interior_basis(interior: Array) -> Array:
+    """(c, 9, 9) columns: derivative of the nine numbers by the adjusted unknowns.
+
+    Unknown 0 changes the mean focal length at fixed fx : fy, unknown 1 the difference of fx and fy at fixed mean; the
+    others are the numbers themselves. So a focal length can be adjusted without an affinity that the data do not carry.
+    """
+    c = len(interior)
+    basis = np.broadcast_to(np.eye(9), (c, 9, 9)).copy()
+    mean = 0.5 * (interior[:, 0] + interior[:, 1])
+    basis[:, 0, 0] = interior[:, 0] / mean
+    basis[:, 1, 0] = interior[:, 1] / mean
+    basis[:, 0, 1] = 0.5
+    basis[:, 1, 1] = -0.5
+    return basis
+
+
+def interior_prior(camera: Camera) -> Array:
+    """(9,) standard deviations of the adjusted unknowns before any data: what lenses on the market do.
+
+    Focal length 20 %, affinity 1 %, principal point 10 % of the longer side; radial terms that move the image corner by
+    30 % of its distance each, decentring by 2 %. They only keep unknowns finite that the images say nothing about.
+    """
+    f = 0.5 * (camera.fx + camera.fy)
+    side = max(camera.width, camera.height)
+    corner = 0.5 * np.hypot(camera.width, camera.height) / f
+    return np.array(
+        [
+            0.2 * f,
+            0.01 * f,
+            0.1 * side,
+            0.1 * side,
+            0.3 / corner**2,
+            0.3 / corner**4,
+            0.02 / corner,
+            0.02 / corner,
+            0.3 / corner**6,
+        ]
+    )
+
+
+@dataclass(frozen=True)
+class Linearisation:
+    """Whitened residuals (m, 2) and derivatives of the image by exterior, interior unknowns, point and pose."""
+
+    residual: Array
+    by_exterior: Array
+    by_interior: Array
+    by_point: Array
+    by_pose: Array
+    whitening: Array
+
+
+def linearise(marks: MarkTable, x: Unknowns, cameras: tuple[Camera, ...], noise: Array) -> Linearisation:
+    """Residuals and Jacobian blocks of all marks; ``noise`` (c,) multiplies each camera's standard deviations.
+
+    Marks whose target comes to lie behind its camera have NaN residuals.
+    """
+    W = whitener(marks.covariance) / noise[marks.camera][:, None, None]
+    camera_T_world = invert(x.world_T_exterior)[marks.exterior]
+    camera_T_body = camera_T_world @ x.world_T_body[marks.pose]
+    R = camera_T_body[:, :3, :3]
+    p_body = x.points[marks.target]
+    p_camera = np.einsum("mij,mj->mi", R, p_body) + camera_T_body[:, :3, 3]
+    seen = effective_point(p_camera, np.einsum("mij,mj->mi", R, marks.normals), marks.radius)
+    m = len(marks)
+    r, d_point, d_in = np.empty((m, 2)), np.empty((m, 2, 3)), np.empty((m, 2, 9))
+    basis = interior_basis(x.interior)
+    for c, camera in enumerate(cameras):
+        rows = marks.camera == c
+        value, d_point[rows], by_numbers = project_with_jacobians(camera.with_vector(x.interior[c]), seen[rows])
+        d_in[rows] = by_numbers @ basis[c]
+        r[rows] = marks.xy[rows] - value
+    d_point = W @ d_point
+    by_point = d_point @ R
+    return Linearisation(
+        np.einsum("mij,mj->mi", W, r),
+        np.concatenate([-d_point, d_point @ skew(p_camera)], axis=-1),
+        W @ d_in,
+        by_point,
+        np.concatenate([by_point, -by_point @ skew(p_body)], axis=-1),
+        W,
+    )
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Weighted observations of unknowns.
+
+    ``interior`` (c, 9) start numbers with ``interior_sigma`` (c, 9) of the adjusted unknowns; ``points`` (t, 3) given
+    coordinates with the inverse covariance ``points_weight`` (3t, 3t), None: coordinates are held.
+    """
+
+    interior: Array
+    interior_sigma: Array
+    points: Array
+    points_weight: Array | None
+
+
+@dataclass(frozen=True)
+class Adjusted:
+    """Solution of the adjustment: unknowns, linearised model, sum of squares of marks and of priors, steps taken."""
+
+    unknowns: Unknowns
+    design: StationDesign
+    cost: float
+    prior_cost: float
+    iterations: int
+    converged: bool
+
+
+def interior_offset(x: Unknowns, prior: Prior) -> Array:
+    """(c, 9) present minus prior interior orientation, in the adjusted unknowns."""
+    difference = x.interior - prior.interior
+    return np.asarray(np.linalg.solve(interior_basis(prior.interior), difference[..., None])[..., 0])
+
+
+def global_columns(marks: MarkTable, e: int, c: int) -> NDArray[np.int64]:
+    """(m, 18) global column numbers of each mark's exterior, interior and point unknowns."""
+    return np.concatenate(
+        [
+            6 * marks.exterior[:, None] + np.arange(6),
+            6 * e + 9 * marks.camera[:, None] + np.arange(9),
+            6 * e + 9 * c + 3 * marks.target[:, None] + np.arange(3),
+        ],
+        axis=1,
+    )
+
+
+def _prior_terms(x: Unknowns, prior: Prior) -> tuple[Array, Array, float]:
+    """Normal matrix, right side and cost of the weighted observations of unknowns."""
+    e, c, t = len(x.world_T_exterior), len(x.interior), len(x.points)
+    g = 6 * e + 9 * c + 3 * t
+    N, b = np.zeros((g, g)), np.zeros(g)
+    at = slice(6 * e, 6 * e + 9 * c)
+    weight = 1.0 / prior.interior_sigma.ravel() ** 2
+    offset = interior_offset(x, prior).ravel()
+    N[at, at] = np.diag(weight)
+    b[at] = -weight * offset
+    cost = float(np.sum(weight * offset**2))
+    if prior.points_weight is not None:
+        miss = (prior.points - x.points).ravel()
+        pull = prior.points_weight @ miss
+        N[6 * e + 9 * c :, 6 * e + 9 * c :] = prior.points_weight
+        b[6 * e + 9 * c :] = pull
+        cost += float(miss @ pull)
+    return N, b, cost
+
+
+@dataclass(frozen=True)
+class _System:
+    reduced: Array
+    right: Array
+    pose_inverse: Array
+    coupling: Array
+    pose_right: Array
+
+
+def _normal(lin: Linearisation, marks: MarkTable, x: Unknowns, prior: Prior, weights: Array) -> _System:
+    e, c, t, p = len(x.world_T_exterior), len(x.interior), len(x.points), len(x.world_T_body)
+    g = 6 * e + 9 * c + 3 * t
+    root = np.sqrt(weights)[:, None]
+    S = np.concatenate([lin.by_exterior, lin.by_interior], axis=-1) * root[..., None]
+    P, B = lin.by_point * root[..., None], lin.by_pose * root[..., None]
+    r = lin.residual * root
+    N, b, _ = _prior_terms(x, prior)
+    W = np.zeros((g, p, 6))
+    points = slice(6 * e + 9 * c, g)
+    b[points] += sum_by(marks.target, np.einsum("mki,mk->mi", P, r), t).ravel()
+    pair = marks.target * p + marks.pose
+    W[points] = sum_by(pair, _product(P, B), t * p).reshape(t, p, 3, 6).transpose(0, 2, 1, 3).reshape(3 * t, p, 6)
+    V, v = np.zeros((p, 6, 6)), np.zeros((p, 6))
+    # marks of one image have the same columns but for the point, marks of one target in one camera but for the pose
+    image = np.concatenate([S, B, r[..., None]], axis=-1)
+    for rows in _groups(marks.exterior * p + marks.pose):
+        at, k = _station_columns(marks, rows[0], e), int(marks.pose[rows[0]])
+        flat = image[rows].reshape(-1, 22)
+        products = flat.T @ flat
+        N[np.ix_(at, at)] += products[:15, :15]
+        b[at] += products[:15, 21]
+        W[at, k] += products[:15, 15:21]
+        V[k] += products[15:21, 15:21]
+        v[k] += products[15:21, 21]
+    sight = np.concatenate([S, P], axis=-1)
+    for rows in _groups(marks.exterior * t + marks.target):
+        at, first = _station_columns(marks, rows[0], e), 6 * e + 9 * c + 3 * int(marks.target[rows[0]])
+        flat = sight[rows].reshape(-1, 18)
+        products = flat[:, 15:].T @ flat
+        N[first : first + 3, at] += products[:, :15]
+        N[at, first : first + 3] += products[:, :15].T
+        N[first : first + 3, first : first + 3] += products[:, 15:]
+    scale = np.sqrt(np.maximum(np.einsum("pii->pi", V), 1e-300))
+    seen = np.einsum("pii->pi", V).min(axis=1) > 0  # a pose whose marks were all left out keeps its value
+    Vi = np.zeros_like(V)
+    outer = scale[:, :, None] * scale[:, None, :]
+    Vi[seen] = np.linalg.inv(V[seen] / outer[seen] + 1e-13 * np.eye(6)) / outer[seen]
+    T = np.matmul(W.transpose(1, 0, 2), Vi).transpose(1, 0, 2).reshape(g, 6 * p)
+    return _System(N - T @ W.reshape(g, 6 * p).T, b - T @ v.ravel(), Vi, W, v)
+
+
+def _groups(key: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+    """Rows (of those with the same key) group by group."""
+    order = np.argsort(key, kind="stable")
+    edges = np.flatnonzero(np.diff(key[order])) + 1
+    return [order[i:j] for i, j in pairwise([0, *edges.tolist(), len(order)])] if len(order) else []
+
+
+def _station_columns(marks: MarkTable, row: int, e: int) -> NDArray[np.int64]:
+    """(15,) global columns of a mark's exterior and interior unknowns."""
+    return np.concatenate([6 * marks.exterior[row] + np.arange(6), 6 * e + 9 * marks.camera[row] + np.arange(9)])
+
+
+def _product(A: Array, B: Array) -> Array:
+    """(m, i, j) products A' B of each mark's derivatives (m, 2, i) and (m, 2, j)."""
+    return np.asarray(A[:, 0, :, None] * B[:, 0, None, :] + A[:, 1, :, None] * B[:, 1, None, :])
+
+
+def _solve_scaled(S: Array, b: Array, names: list[str]) -> tuple[Array, Array]:
+    """Solution and inverse of a symmetric positive system, scaled to unit diagonal first."""
+    scale = np.sqrt(np.maximum(np.diag(S), 1e-300))
+    unit = S / np.outer(scale, scale)
+    try:
+        factor = linalg.cho_factor(unit, lower=True)
+    except linalg.LinAlgError:
+        vectors = np.linalg.eigh(unit)[1]
+        weak = np.abs(vectors[:, 0])
+        tied = [names[i] for i in np.argsort(weak)[::-1][:4] if weak[i] > 0.2]
+        raise NotIdentifiable(
+            "the images do not determine " + ", ".join(tied) + ": add poses that are tilted and at other distances, "
+            "or give camera files and keep intrinsics fixed",
+            tied,
+        ) from None
+    inverse = linalg.cho_solve(factor, np.eye(len(S)))
+    return linalg.cho_solve(factor, b / scale) / scale, inverse / np.outer(scale, scale)
+
+
+def unknown_names(cameras: tuple[str, ...], exterior: list[str], ids: NDArray[np.int64]) -> list[str]:
+    """Names of the global unknowns in their order."""
+    six = ("x", "y", "z", "rx", "ry", "rz")
+    interior = ("f", "affinity", *INTRINSIC_NAMES[2:])
+    names = [f"{name}.{k}" for name in exterior for k in six]
+    names += [f"{name}.{k}" for name in cameras for k in interior]
+    return names + [f"target {i}.{k}" for i in ids for k in "xyz"]
+
+
+def _apply(x: Unknowns, global_step: Array, pose_step: Array, basis: Array) -> Unknowns:
+    e, c = len(x.world_T_exterior), len(x.interior)
+    exterior = global_step[: 6 * e].reshape(e, 6)
+    interior = np.einsum("cij,cj->ci", basis, global_step[6 * e : 6 * e + 9 * c].reshape(c, 9))
+    return Unknowns(
+        x.interior + interior,
+        retract(x.world_T_exterior, exterior),
+        retract(x.world_T_body, pose_step),
+        x.points + global_step[6 * e + 9 * c :].reshape(-1, 3),
+    )
+
+
+def huber_weights(residual: Array, limit: float) -> Array:
+    """(m,) weights of Huber's function on the length of each whitened residual (m, 2); 0 for NaN."""
+    size = np.linalg.norm(residual, axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(np.isfinite(size), np.where(size <= limit, 1.0, limit / size), 0.0)
+
+
+def _robust_cost(residual: Array, limit: float | None) -> float:
+    size = np.linalg.norm(residual, axis=1)
+    if not np.isfinite(size).all():
+        return np.inf
+    if limit is None:
+        return float(np.sum(size**2))
+    return float(np.sum(np.where(size <= limit, size**2, 2 * limit * size - limit**2)))
+
+
+def adjust_station(
+    marks: MarkTable,
+    start: Unknowns,
+    cameras: tuple[Camera, ...],
+    active: NDArray[np.bool_],
+    prior: Prior,
+    noise: Array,
+    names: list[str],
+    *,
+    huber: float | None = None,
+    max_iterations: int = 30,
+) -> Adjusted:
+    """Adjust the active global unknowns and all poses.
+
+    Parameters
+    ----------
+    active : (6e + 9c + 3t,) which exterior, interior and point unknowns are free.
+    noise : (c,) factor on each camera's standard deviations.
+    huber : limit of the robust weights in standard deviations; None for plain least squares.
+
+    Raises
+    ------
+    NotIdentifiable : the reduced normal matrix of the active unknowns is singular.
+    """
+    x = start
+    converged = False
+    on = np.flatnonzero(active)
+    active_names = [names[i] for i in on]
+    iterations = 0
+    lin = linearise(marks, x, cameras, noise)
+    cost = _robust_cost(lin.residual, huber) + _prior_terms(x, prior)[2]
+    for _ in range(max_iterations):
+        weights = np.ones(len(marks)) if huber is None else huber_weights(lin.residual, huber)
+        clean = Linearisation(*(np.where(np.isfinite(a), a, 0.0) for a in vars(lin).values()))
+        system = _normal(clean, marks, x, prior, weights)
+        step = np.zeros(len(active))
+        step[on] = _solve_scaled(system.reduced[np.ix_(on, on)], system.right[on], active_names)[0]
+        rest = system.pose_right - np.einsum("gpi,g->pi", system.coupling, step)
+        pose_step = np.einsum("pij,pj->pi", system.pose_inverse, rest)
+        basis = interior_basis(x.interior)
+        factor = 1.0
+        for _ in range(12):
+            trial = _apply(x, factor * step, factor * pose_step, basis)
+            lin_trial = linearise(marks, trial, cameras, noise)
+            cost_trial = _robust_cost(lin_trial.residual, huber) + _prior_terms(trial, prior)[2]
+            if cost_trial <= cost * (1 + 1e-12) or (not np.isfinite(cost) and np.isfinite(cost_trial)):
+                break
+            factor *= 0.5
+        else:
+            converged = True  # no descent along the Gauss-Newton step: at the floor of the arithmetic
+            break
+        gain = cost - cost_trial
+        x, lin, cost = trial, lin_trial, cost_trial
+        iterations += 1
+        if gain <= 1e-7 * max(1.0, cost / max(1, len(marks))):
+            converged = True
+            break
+    weights = np.ones(len(marks)) if huber is None else huber_weights(lin.residual, huber)
+    clean = Linearisation(*(np.where(np.isfinite(a), a, 0.0) for a in vars(lin).values()))
+    system = _normal(clean, marks, x, prior, weights)
+    inverse = np.zeros_like(system.reduced)
+    inverse[np.ix_(on, on)] = _solve_scaled(system.reduced[np.ix_(on, on)], system.right[on], active_names)[1]
+    design = StationDesign(
+        clean.residual,
+        clean.by_exterior,
+        clean.by_interior,
+        clean.by_point,
+        clean.by_pose,
+        lin.whitening,
+        weights,
+        active,
+        inverse,
+        system.pose_inverse,
+        system.coupling,
+    )
+    mark_cost = float(np.sum(clean.residual**2))
+    return Adjusted(x, design, mark_cost, _prior_terms(x, prior)[2], iterations, converged)
+
+
+def covariance_blocks(design: StationDesign, marks: MarkTable, e: int, c: int) -> tuple[Array, Array]:
+    """Marginal covariances (p, 6, 6) of the poses and redundancy matrices (m, 2, 2) of the whitened marks.
+
+    ``Q_pp = V^-1 + V^-1 W' Q_gg W V^-1`` per pose, ``Q_gp = -Q_gg W V^-1``; redundancy ``I - A Q A'``; ``e`` and ``c``
+    are the numbers of exterior and interior orientations.
+    """
+    Q, Vi, W = design.reduced_inverse, design.pose_inverse, design.coupling
+    g, p = len(Q), len(Vi)
+    T = np.matmul(W.transpose(1, 0, 2), Vi)
+    Qgp = -np.matmul(Q, T.transpose(1, 0, 2).reshape(g, 6 * p)).reshape(g, p, 6)
+    Qpp = Vi - np.matmul(T.transpose(0, 2, 1), Qgp.transpose(1, 0, 2))
+    columns = global_columns(marks, e, c)
+    A = np.concatenate([design.by_exterior, design.by_interior, design.by_point], axis=-1)
+    B = design.by_pose
+    covariance = np.empty((len(marks), 2, 2))
+    # marks of one target in one exterior orientation have the same columns
+    group = marks.exterior * (int(marks.target.max(initial=0)) + 1) + marks.target
+    for rows in _groups(group):
+        at = columns[rows[0]]
+        own = A[rows]
+        covariance[rows] = np.matmul(
+            (own.reshape(-1, 18) @ Q[np.ix_(at, at)]).reshape(own.shape), own.transpose(0, 2, 1)
+        )
+        both = np.matmul(own, Qgp[np.ix_(at, marks.pose[rows])].transpose(1, 0, 2))
+        cross = np.matmul(both, B[rows].transpose(0, 2, 1))
+        covariance[rows] += cross + cross.transpose(0, 2, 1)
+    covariance += np.matmul(np.matmul(B, Qpp[marks.pose]), B.transpose(0, 2, 1))
+    return Qpp, np.eye(2) - covariance

@@ -1,0 +1,258 @@
+"""Orientation of a station: joint adjustment of fixed cameras from a body that was shown to them in many poses."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from robcal.errors import DegenerateGeometry, InvalidInput, NotIdentifiable
+from robcal.photogrammetry.core.bodies import Body
+from robcal.photogrammetry.core.camera import Camera
+from robcal.photogrammetry.station.adjustment import Adjusted, covariance_blocks, interior_basis, interior_offset
+from robcal.photogrammetry.station.cleaning import drop_insignificant, resolve_contradictions, snoop
+from robcal.photogrammetry.station.network import (
+    GROUPS,
+    Evidence,
+    RejectedMark,
+    StationMarks,
+    StationOrientation,
+    StationSettings,
+)
+from robcal.photogrammetry.station.start import (
+    ImageStart,
+    connect_cameras,
+    exchanged,
+    find_swap,
+    focal_start,
+    resect_station,
+    start_bodies,
+)
+from robcal.photogrammetry.station.state import StationState, assemble
+from robcal.transforms import Array
+
+
+def orient_station(
+    observations: Mapping[str, StationMarks],
+    body: Body,
+    cameras: Mapping[str, Camera | None],
+    sizes: Mapping[str, tuple[int, int]],
+    world_T_camera: Mapping[str, Array] | None = None,
+    settings: StationSettings | None = None,
+) -> StationOrientation:
+    """Orient the cameras of a station.
+
+    Parameters
+    ----------
+    observations : camera name -> identified marks; the first camera defines the world unless one is stated.
+    body : with coordinates (and their covariance) that carry the scale.
+    cameras : start values of the interior orientation, None: from the image size alone.
+    sizes : camera name -> (width, height) px, used where there are no start values.
+    world_T_camera : exterior orientations stated in camera files; the first stated one defines the world, the others
+        serve only for cameras that nothing else connects.
+    settings : see :class:`StationSettings`.
+
+    Raises
+    ------
+    InvalidInput : no marks at all, marks of unknown targets, or a camera that nothing connects with the others.
+    DegenerateGeometry : no image carries a pose (fewer than three known targets, or all in one line).
+    NotIdentifiable : the images leave unknowns undetermined.
+    """
+    options = settings or StationSettings()
+    names = tuple(observations)
+    if not names:
+        raise InvalidInput("a station needs at least one camera")
+    known = body.known
+    if known.sum() < 3:
+        raise DegenerateGeometry(
+            f"body {body.name} has {known.sum()} targets with coordinates; orienting a station needs three or more"
+        )
+    stated = dict(world_T_camera or {})
+    marks = [_usable(name, observations[name], body) for name in names]
+    start = [
+        given if (given := cameras.get(n)) is not None else _self_calibrated(n, m, body, sizes[n], options, len(names))
+        for n, m in zip(names, marks, strict=True)
+    ]
+    images, failed = resect_station(names, marks, start, body, options.default_sigma_px)
+    if not images:
+        reason = failed[0][2] if failed else "no marks"
+        raise DegenerateGeometry(f"no image of the station carries a pose of body {body.name}: {reason}")
+    evidence: list[Evidence] = []
+    swap = find_swap(marks, start, body, options.default_sigma_px, images)
+    if swap is not None:
+        evidence.append(_swap_evidence(body, *swap))
+        body = exchanged(body, *swap)
+        images, failed = resect_station(names, marks, start, body, options.default_sigma_px)
+    exterior, fixed, contradicting = connect_cameras(names, images, stated)
+    bad = set(contradicting)
+    rejected = [
+        RejectedMark(names[c], p, -1, "image contradicts the other cameras: another pose shown?", "contradiction")
+        for c, p in sorted(bad)
+    ]
+    rejected += [RejectedMark(names[c], p, -1, reason, "no_pose") for c, p, reason in failed]
+    good = [s for s in images if (s.camera, s.pose) not in bad]
+    rejected += _left_out_by_resection(names, marks, good)
+    if not good:
+        raise DegenerateGeometry("the cameras contradict one another in every pose: images of different poses")
+    bodies = start_bodies(good, marks, start, exterior, body, options.default_sigma_px)
+    ambiguous = [p for p, (_, cost, second, n) in bodies.items() if n == 1 and second < cost + 14 * max(1.0, cost / 4)]
+    several = any(n > 1 for _, _, _, n in bodies.values())
+    use = {p: T for p, (T, _, _, _) in bodies.items() if not several or p not in ambiguous}
+    state = assemble(names, marks, good, use, body, start, exterior, fixed, cameras, options)
+    cleaned = resolve_contradictions(state, state.robust_adjustment())
+    drop_insignificant(state, cleaned.adjusted)
+    adjusted, outliers = snoop(state)
+    evidence += [*cleaned.evidence, *_lens_evidence(state, adjusted, cameras)]
+    left = _tell_recurring([*rejected, *cleaned.rejected, *outliers], marks)
+    return _result(state, adjusted, tuple(sorted(ambiguous)), tuple(evidence), left)
+
+
+def _self_calibrated(
+    name: str, marks: StationMarks, body: Body, size: tuple[int, int], options: StationSettings, cameras: int
+) -> Camera:
+    """Start values of a camera without a file: from the image size; in a station of several, by itself first."""
+    start = focal_start(marks, body, size, options.default_sigma_px)
+    if cameras == 1:
+        return start
+    alone = replace(options, intrinsics="auto", detect_moves=False, detect_targets=False, epochs={})
+    try:
+        return orient_station({name: marks}, body, {name: None}, {name: size}, settings=alone).cameras[0]
+    except NotIdentifiable:  # one camera alone may see too little (frontal views only); the others will help
+        return start
+
+
+def _swap_evidence(body: Body, i: int, j: int) -> Evidence:
+    a, b = int(body.ids[i]), int(body.ids[j])
+    text = f"targets {a} and {b} of body {body.name} are swapped: with exchanged coordinates the images fit"
+    shift = body.points[j] - body.points[i]
+    return Evidence("target_swapped", f"{a},{b}", None, shift, np.zeros((3, 3)), float("inf"), 3, text)
+
+
+def _left_out_by_resection(
+    names: tuple[str, ...], marks: list[StationMarks], images: list[ImageStart]
+) -> list[RejectedMark]:
+    """Marks that the pose of their own image leaves far off."""
+    out = []
+    for s in images:
+        m = marks[s.camera]
+        for i in np.setdiff1d(np.flatnonzero(m.pose == s.pose), s.rows):
+            reason = "far from where the pose of its image puts it"
+            out.append(RejectedMark(names[s.camera], s.pose, int(m.target[i]), reason))
+    return out
+
+
+def _tell_recurring(rejected: list[RejectedMark], marks: list[StationMarks]) -> tuple[RejectedMark, ...]:
+    """Where most marks of a target were left out it is the target, not the marks: they keep being measured."""
+    seen: dict[int, int] = {}
+    for m in marks:
+        for t, n in zip(*np.unique(m.target, return_counts=True), strict=True):
+            seen[int(t)] = seen.get(int(t), 0) + int(n)
+    gone: dict[int, int] = {}
+    for r in rejected:
+        if r.kind == "outlier":
+            gone[r.target] = gone.get(r.target, 0) + 1
+    often = {t for t, n in gone.items() if n > 0.5 * seen.get(t, 1) and n >= 5}
+    return tuple(replace(r, kind="recurring") if r.kind == "outlier" and r.target in often else r for r in rejected)
+
+
+def _usable(name: str, marks: StationMarks, body: Body) -> StationMarks:
+    at = body.index(marks.target)
+    if np.any(at < 0):
+        row = int(np.flatnonzero(at < 0)[0])
+        raise InvalidInput(
+            f"camera {name}, pose {marks.pose[row]}: target {marks.target[row]} is not on body {body.name}"
+        )
+    keep = body.known[at]
+    key = np.column_stack([marks.pose[keep], marks.target[keep]])
+    values, counts = np.unique(key, axis=0, return_counts=True)
+    if np.any(counts > 1):
+        pose, target = values[counts > 1][0]
+        raise InvalidInput(f"camera {name}, pose {pose}: target {target} is measured more than once")
+    return StationMarks(marks.pose[keep], marks.target[keep], marks.xy[keep], marks.covariance[keep])
+
+
+def _lens_evidence(state: StationState, adjusted: Adjusted, given: Mapping[str, Camera | None]) -> tuple[Evidence, ...]:
+    """Groups that are zero in a camera's file and yet significant in the images."""
+    out: list[Evidence] = []
+    e = len(state.exterior_camera)
+    offset = interior_offset(state.unknowns, state.prior)
+    families = {"radial": ("k1", "k2", "k3"), "tangential": ("tangential",), "affinity": ("affinity",)}
+    for c, name in enumerate(state.names):
+        if given.get(name) is None or state.settings.intrinsics == "fixed":
+            continue
+        for family, groups in families.items():
+            found = [g for g in groups if g in state.groups[c]]
+            if not found or any(g in state.kept[c] for g in groups):
+                continue
+            numbers = [i for g in found for i in GROUPS[g]]
+            at = 6 * e + 9 * c + np.array(numbers)
+            Q = adjusted.design.reduced_inverse[np.ix_(at, at)]
+            d = offset[c, numbers]
+            statistic = float(d @ np.linalg.solve(Q, d))
+            text = f"camera {name} has {family} distortion ({', '.join(found)}) that its file does not have"
+            out.append(Evidence(f"lens_{family}", name, None, d, Q, statistic, len(at), text))
+    return tuple(out)
+
+
+def _result(
+    state: StationState,
+    adjusted: Adjusted,
+    ambiguous: tuple[int, ...],
+    evidence: tuple[Evidence, ...],
+    rejected: tuple[RejectedMark, ...],
+) -> StationOrientation:
+    marks, design, x = state.marks, adjusted.design, state.unknowns
+    e, c, t = len(state.exterior_camera), len(state.names), len(state.body)
+    Qpp, R = covariance_blocks(design, marks, e, c)
+    diagonal = np.einsum("mii->mi", R)
+    total = float(diagonal.sum())
+    raw = design.residual * state.noise[marks.camera][:, None]
+    sigma0 = float(np.sqrt(np.sum(raw**2) / total)) if total > 0 else float("nan")
+    pixels = np.einsum("mij,mj->mi", np.linalg.inv(design.whitening), design.residual)
+    # exterior and interior covariance, the interior in its nine numbers
+    station = slice(0, 6 * e + 9 * c)
+    to_numbers = np.eye(6 * e + 9 * c)
+    basis = interior_basis(x.interior)
+    for i in range(c):
+        at = slice(6 * e + 9 * i, 6 * e + 9 * i + 9)
+        to_numbers[at, at] = basis[i]
+    covariance = to_numbers @ design.reduced_inverse[station, station] @ to_numbers.T
+    seen = np.unique(marks.target)
+    points = np.where(np.isin(np.arange(t), seen)[:, None], x.points, state.body.points)
+    C = design.reduced_inverse[-3 * t :, -3 * t :].copy()
+    rest = np.setdiff1d(np.arange(t), seen)
+    if state.body.covariance is not None and len(rest):
+        unseen = (3 * rest[:, None] + np.arange(3)).ravel()
+        C[np.ix_(unseen, unseen)] = state.body.covariance[np.ix_(unseen, unseen)]
+    cameras_of_pose = np.zeros((len(state.poses), c), dtype=bool)
+    cameras_of_pose[marks.pose, marks.camera] = True
+    with np.errstate(divide="ignore", invalid="ignore"):
+        w = np.where(diagonal > 1e-4, design.residual / np.sqrt(np.maximum(diagonal, 1e-12)), 0.0)
+    return StationOrientation(
+        names=state.names,
+        cameras=tuple(camera.with_vector(x.interior[i]) for i, camera in enumerate(state.start)),
+        exterior_camera=state.exterior_camera,
+        exterior_first_pose=state.exterior_first,
+        world_T_exterior=x.world_T_exterior,
+        covariance=covariance,
+        poses=state.poses,
+        world_T_body=x.world_T_body,
+        body_covariance=Qpp,
+        pose_cameras=cameras_of_pose.sum(axis=1),
+        ambiguous_poses=ambiguous,
+        body=replace(state.body, points=points, covariance=C),
+        marks=marks,
+        design=design,
+        redundancy=diagonal,
+        w=w,
+        sigma0=sigma0,
+        noise=dict(zip(state.names, map(float, state.noise), strict=True)),
+        redundancy_total=total,
+        rms_px=float(np.sqrt(np.mean(pixels**2))),
+        rejected=rejected,
+        evidence=evidence,
+        free_interior={name: tuple(g for g in GROUPS if g in state.groups[i]) for i, name in enumerate(state.names)},
+        converged=adjusted.converged,
+        iterations=adjusted.iterations,
+    )

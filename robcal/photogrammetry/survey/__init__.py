@@ -1,0 +1,1 @@
+"""From the images of a body to its adjusted coordinates."""

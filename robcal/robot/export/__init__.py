@@ -1,0 +1,1 @@
+"""The calibrated robot for controllers: C, programs."""
