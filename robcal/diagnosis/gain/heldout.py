@@ -1,0 +1,85 @@
+"""Gain on data kept out: verification poses, or folds of whole blocks of poses."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from robcal.calibration.observations import DistanceObservations, FrameObservations, PointObservations
+from robcal.diagnosis.core.fitting import Accepted, Fit, solve
+from robcal.diagnosis.core.recording import Recording, observation_data
+from robcal.physics.cause import Array
+from robcal.transforms import invert, transform
+
+FOLDS = 8
+
+
+def position_errors(recording: Recording, fitted: Fit, accepted: Sequence[Accepted] | None = None) -> Array:
+    """Measured minus modelled positions (m_obs, 3), or lengths (m_obs, 1), with a model fitted elsewhere.
+
+    Errors that all poses share (orientation of the station) are taken off as they were estimated there.
+    """
+    kernel = fitted.kernel
+    inputs = recording.inputs(kernel)
+    frames = kernel.frames(fitted.theta, inputs)
+    obs = recording.observations
+    T = frames[obs.pose]
+    if isinstance(obs, FrameObservations):
+        error = (invert(T) @ obs.world_T_tool)[:, :3, 3]
+    elif isinstance(obs, PointObservations):
+        error = obs.p_world - transform(T, obs.p_tool)
+    elif isinstance(obs, DistanceObservations):
+        error = (obs.distance - np.linalg.norm(T[:, :3, 3], axis=1))[:, None]
+    else:
+        error = obs.p_world - transform(T, obs.p_sensor)
+    if recording.common is not None and fitted.common is not None:
+        error = error - (recording.common @ fitted.common)[:, :3]
+    variables = kernel.variables(fitted.theta, inputs)
+    for item in fitted.accepted if accepted is None else accepted:
+        if item.family.displace is not None:
+            shift = item.family.displace(observation_data(recording, frames, variables), item.constants) @ item.values
+            if isinstance(obs, PointObservations):
+                error = error - shift
+            elif isinstance(obs, FrameObservations):
+                error = error - shift[:, :3]
+            else:
+                error = error - shift.reshape(error.shape)
+    return error
+
+
+def rms(errors: Array) -> float:
+    """Root mean square of the lengths of error vectors (m, k)."""
+    return float(np.sqrt(np.mean(np.sum(errors**2, axis=1))))
+
+
+def folds(recording: Recording, count: int = FOLDS) -> Array:
+    """Fold of each pose (n,): blocks of consecutive poses, so that slow effects and repeats stay together."""
+    order = np.argsort(np.argsort(recording.covariates["index"]))
+    blocks = min(2 * count, len(order))
+    return (order * blocks // len(order)) % count
+
+
+def cross_validated(recording: Recording, fitted: Fit, labels: Array) -> Array:
+    """Errors (m_obs, 3) of each observation predicted from the other folds, by the linearised fit.
+
+    Only position rows count. The linearised refit is exact to second order in what a fold changes.
+    """
+    m = len(fitted.residual)
+    per = m // len(recording.observations.pose)
+    fold_of_row = labels[fitted.row_pose]
+    predicted = np.empty(m)
+    for fold in np.unique(labels):
+        test = fold_of_row == fold
+        rows = np.vstack([fitted.jacobian[~test], fitted.prior])
+        step = solve(rows, np.concatenate([fitted.residual[~test], fitted.prior_residual]))
+        predicted[test] = fitted.residual[test] - fitted.jacobian[test] @ step
+    return recording.local(predicted[:, None], fitted.frames)[:, : min(per, 3), 0]
+
+
+def noise_floor(recording: Recording, factor: float) -> float:
+    """Root mean square of the position error that the measurement itself has, metres."""
+    if isinstance(recording.observations, DistanceObservations):
+        return float(np.sqrt(np.mean(recording.observations.sigma**2) * factor))
+    covariance = recording.observations.covariance
+    return float(np.sqrt(np.mean(np.trace(covariance[:, :3, :3], axis1=1, axis2=2)) * factor))

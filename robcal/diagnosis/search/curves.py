@@ -1,0 +1,368 @@
+"""Errors of many joints over their own angle, found together: encoders and gears whose error repeats every turn.
+
+A scan that adds one cause at a time drowns where every joint of a robot has an irregular error curve: each cause is
+looked for in the structure that the other joints leave. Here all joints get a curve of bumps on the circle at once, a
+Gaussian process with period one turn, and the poses of whole blocks that were kept out decide whether the curves are
+true. A curve that a few waves describe as well is left to the causes with a name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from robcal.diagnosis.core.fitting import Accepted, Fit
+from robcal.diagnosis.core.recording import Recording
+from robcal.diagnosis.gain.heldout import folds, rms
+from robcal.diagnosis.scan.statistics import log_f_probability
+from robcal.diagnosis.scan.tangents import tangents
+from robcal.physics.cause import Array, Family
+from robcal.physics.empirical import periodic_curve
+from robcal.physics.site import RobotSite
+from robcal.robot.model import Term
+
+LEAST_POSES = 150
+"""Fewer poses cannot tell curves of all joints from anything else."""
+BUMPS_A_TURN = (24, 36, 48, 72)
+"""Numbers of bumps a turn that are tried; the kept-out poses choose."""
+ROWS_A_BUMP = 4.0
+"""Measured numbers that are needed for each bump."""
+GAIN = 0.7
+"""Share of the square sum at kept-out poses below which the curves must come."""
+LEAST_GAIN = 0.03
+"""Share of that square sum by which the kept-out poses must miss the curve of a joint for it to count."""
+WAVES = 2
+HIGHEST_WAVE = 60.0
+IRREGULAR = 0.35
+"""Share of a curve's variance that so many waves leave: below, the curve is regular and has a name."""
+SEVERAL = 2
+"""With so many irregular joints all joints get a curve."""
+
+
+@dataclass(frozen=True)
+class Likeness:
+    """A joint whose curve is that of another: `joint(q) = sense * other(sense * q + shift)`.
+
+    Attributes
+    ----------
+    joint, other : a joint and an earlier one that has the same curve. shift : rad.
+    sense : -1 for a part mounted the other way round.
+    correlation : of the two curves where both are known. overlap : rad.
+    """
+
+    joint: str
+    other: str
+    sense: int
+    shift: float
+    correlation: float
+    overlap: float
+
+
+@dataclass(frozen=True)
+class Curves:
+    """Error curves of joints.
+
+    Attributes
+    ----------
+    accepted : one family per joint with its amplitudes, to be fitted again with everything else.
+    shares : share of the square sum above the noise that each explains.
+    likenesses : joints whose curves are alike.
+    p_value : of the F test of all curves together, for all scales tried.
+    """
+
+    accepted: tuple[Accepted, ...] = ()
+    shares: tuple[float, ...] = ()
+    likenesses: tuple[Likeness, ...] = ()
+    p_value: float = 1.0
+
+    @property
+    def frozen(self) -> tuple[Term, ...]:
+        """The curves as terms without parameters, for a search of what else is missing."""
+        return tuple(term for item in self.accepted for term in frozen_terms(item))
+
+
+def find_curves(present: Fit, recording: Recording) -> Curves:
+    """Curves of all joints whose errors follow their own angle irregularly; none where that is not proved.
+
+    Parameters
+    ----------
+    present : the fitted robot at the poses of the recording.
+
+    Weakness: one scale of the bumps for all joints; an error that depends on the number of the turn is averaged.
+    """
+    if len(recording.q) < LEAST_POSES or not recording.observations_are_spatial:
+        return Curves()
+    at = tangents(present, recording)
+    site = RobotSite(present.model, at.variables, frozenset(present.free), frozenset())
+    joints = [j for j in site.joints if not j.prismatic and site.varies(f"q{j.number}", 0.5)]
+    label = folds(recording)[present.row_pose]
+    best: tuple[float, _Folded, list[Family], list[Array]] | None = None
+    for count in BUMPS_A_TURN:
+        families = [periodic_curve(j, site.variables[f"q{j.number}"], count) for j in joints]
+        columns = [at.columns(f, f.grid[0]) * f.sizes(f.grid[0]) for f in families]
+        visited = sum(_visited(site.variables[f"q{j.number}"], count) for j in joints)
+        if ROWS_A_BUMP * visited > len(present.residual):
+            break
+        folded = _folded(present, columns, label)
+        after = folded.kept_out(range(len(columns)))
+        if best is None or after < best[0]:
+            best = after, folded, families, columns
+    if best is None:
+        return Curves()
+    after, folded, families, columns = best
+    before = folded.kept_out(())
+    if after > GAIN * before:
+        return Curves()
+    everyone = range(len(columns))
+    matters = [folded.kept_out([j for j in everyone if j != k]) - after > LEAST_GAIN * before for k in everyone]
+    values = _solve(present, columns)
+    irregular = [
+        k
+        for k in everyone
+        if matters[k]
+        and _irregularity(
+            families[k], values[k] * families[k].sizes(families[k].grid[0]), site.variables[f"q{joints[k].number}"]
+        )
+        > IRREGULAR
+    ]
+    # where it is the make of the joints, all have it, also those whose few angles do not show how irregular it is
+    keep = irregular if len(irregular) < SEVERAL else list(everyone)
+    if not keep or folded.kept_out(keep) > GAIN * before:
+        return Curves()
+    chosen = [columns[k] for k in keep]
+    values = _solve(present, chosen)
+    r = present.residual
+    square = float(r @ r)
+    shares = tuple(float(np.clip((c @ v) @ r / square, 0.0, 1.0)) for c, v in zip(chosen, values, strict=True))
+    left = r - np.sum([c @ v for c, v in zip(chosen, values, strict=True)], axis=0)
+    count = sum(_visited(site.variables[f"q{joints[k].number}"], chosen[0].shape[1]) for k in keep)
+    log_p = log_f_probability(
+        np.array([square - left @ left]), np.array([count]), np.array([square]), len(r) - present.jacobian.shape[1]
+    )
+    accepted = tuple(
+        Accepted(f := families[k], f.grid[0], v * f.sizes(f.grid[0]), np.zeros((len(v), len(v))))
+        for k, v in zip(keep, values, strict=True)
+    )
+    alike = likenesses(accepted, [site.variables[f"q{joints[k].number}"] for k in keep])
+    return Curves(accepted, shares, alike, float(min(1.0, len(BUMPS_A_TURN) * np.exp(log_p[0]))))
+
+
+def _visited(angles: Array, bumps: int) -> int:
+    """Number of bumps of a turn near which a joint was."""
+    return len(np.unique(np.round(angles / (2.0 * np.pi) * bumps).astype(int) % bumps))
+
+
+def frozen_terms(item: Accepted) -> tuple[Term, ...]:
+    """Terms with the amplitudes as numbers."""
+    bases = item.family.bases(item.constants) if item.family.bases is not None else ()
+    parts = [f"{float(v)!r}*({b.expression})" for b, v in zip(bases, item.values, strict=True)]
+    return tuple(
+        Term(f"{item.family.where}_held_{k}", bases[0].frame, bases[0].kind, " + ".join(parts[k : k + 24]))
+        for k in range(0, len(parts), 24)
+    )
+
+
+def curve(item: Accepted, angles: Array) -> Array:
+    """Value (n,) of an accepted curve at angles (n,) of its joint, rad."""
+    name = item.family.covariates[0]
+    bases = item.family.bases(item.constants) if item.family.bases is not None else ()
+    return np.asarray(np.sum([v * b.value({name: angles}) for b, v in zip(bases, item.values, strict=True)], axis=0))
+
+
+def nested_errors(
+    present: Fit, recording: Recording, accepted: Sequence[Accepted], verify: Recording | None
+) -> tuple[float, ...]:
+    """RMS position error (m) at kept-out poses without curves, with the first, the first two ..., to first order.
+
+    At the poses to verify, or else at folds of the recording.
+    """
+    at = tangents(present, recording)
+    sizes = np.concatenate([item.family.sizes(item.constants) for item in accepted])
+    X = np.column_stack([_scaled(present), *(at.columns(a.family, a.constants) for a in accepted)])
+    p = len(present.free)
+    X[:, p:] *= sizes
+    r = present.residual
+    ends = p + np.cumsum([0, *(len(a.values) for a in accepted)])
+    variance = _variance(present, X, X.T @ X, X.T @ r, p)
+
+    def solved(rows: Array, end: int) -> Array:
+        A = X[rows, :end]
+        return _Normals(A.T @ A, A.T @ r[rows], p).solve(variance)
+
+    def error(of: Recording, left: Array, frames: Array) -> float:
+        return rms(of.unwhiten(left[:, None], frames)[:, :3, 0])
+
+    if verify is not None:
+        there, Y = _at_other_poses(present, verify, accepted)
+        Y[:, :p] /= np.where((size := np.linalg.norm(present.jacobian, axis=0)) > 0, size, 1.0)
+        Y[:, p:] *= sizes
+        everything = np.ones(len(r), dtype=bool)
+        return tuple(error(verify, there.residual - Y[:, :end] @ solved(everything, end), there.frames) for end in ends)
+    label = folds(recording)[present.row_pose]
+    out = []
+    for end in ends:
+        left = np.empty(len(r))
+        for fold in np.unique(label):
+            test = label == fold
+            left[test] = r[test] - X[test, :end] @ solved(~test, end)
+        out.append(error(recording, left, present.frames))
+    return tuple(out)
+
+
+def _at_other_poses(present: Fit, recording: Recording, accepted: Sequence[Accepted]) -> tuple[Fit, Array]:
+    """A fit looked at from other poses, and the columns of its parameters and of the curves there."""
+    inputs = recording.inputs(present.kernel)
+    columns = np.array([present.kernel.index[name] for name in present.free])
+    frames, J = present.kernel.frames_and_jacobian(present.theta, inputs, columns=columns)
+    residual, jacobian = recording.linearise(frames, J)
+    pose = recording.observations.pose
+    row_pose = np.repeat(pose, len(residual) // len(pose))
+    there = replace(present, inputs=inputs, frames=frames, residual=residual, jacobian=jacobian, row_pose=row_pose)
+    at = tangents(there, recording)
+    return there, np.column_stack([jacobian, *(at.columns(a.family, a.constants) for a in accepted)])
+
+
+@dataclass(frozen=True)
+class _Normals:
+    """Normal equations of the fitted parameters and of columns whose amplitudes have a unit prior."""
+
+    gram: Array
+    right: Array
+    fitted: int
+
+    def solve(self, variance: float) -> Array:
+        """Parameters and amplitudes; the prior weighs as the variance factor says."""
+        ridge = np.full(len(self.right), 1e-9 * np.max(np.diag(self.gram)))
+        ridge[self.fitted :] = variance
+        return np.linalg.solve(self.gram + np.diag(ridge), self.right)
+
+
+def _scaled(present: Fit) -> Array:
+    size = np.linalg.norm(present.jacobian, axis=0)
+    return present.jacobian / np.where(size > 0, size, 1.0)
+
+
+@dataclass(frozen=True)
+class _Folded:
+    """Normal equations of each fold, and in them the places of the fitted parameters and of each joint's columns."""
+
+    folds: tuple[tuple[Array, Array, float], ...]
+    ends: Array
+    variance: float
+
+    def kept_out(self, joints: Iterable[int]) -> float:
+        """Square sum of the residuals that the other folds predict with the curves of the given joints."""
+        fitted = int(self.ends[0])
+        at = np.concatenate([np.arange(fitted), *(np.arange(self.ends[k], self.ends[k + 1]) for k in joints)])
+        gram = np.sum([f[0] for f in self.folds], axis=0)[np.ix_(at, at)]
+        right = np.sum([f[1] for f in self.folds], axis=0)[at]
+        total = 0.0
+        for N, b, square in self.folds:
+            here, own = N[np.ix_(at, at)], b[at]
+            x = _Normals(gram - here, right - own, fitted).solve(self.variance)
+            total += square - 2.0 * float(x @ own) + float(x @ here @ x)
+        return total
+
+
+def _folded(present: Fit, columns: Sequence[Array], label: Array) -> _Folded:
+    fitted = _scaled(present)
+    X, r = np.column_stack([fitted, *columns]), present.residual
+    folds = []
+    for fold in np.unique(label):
+        A, b = X[label == fold], r[label == fold]
+        folds.append((A.T @ A, A.T @ b, float(b @ b)))
+    ends = np.cumsum([fitted.shape[1], *(c.shape[1] for c in columns)])
+    gram, right = np.sum([f[0] for f in folds], axis=0), np.sum([f[1] for f in folds], axis=0)
+    return _Folded(tuple(folds), ends, _variance(present, X, gram, right, fitted.shape[1]))
+
+
+def _variance(present: Fit, X: Array, gram: Array, right: Array, fitted: int) -> float:
+    """Variance factor with the columns in the model: two rounds, from that without."""
+    variance = present.variance_factor
+    for _ in range(2):
+        left = present.residual - X @ _Normals(gram, right, fitted).solve(variance)
+        variance = float(left @ left) / max(len(left) - X.shape[1], 1)
+    return variance
+
+
+def _solve(present: Fit, columns: Sequence[Array]) -> list[Array]:
+    fitted = _scaled(present)
+    X = np.column_stack([fitted, *columns])
+    gram, right = X.T @ X, X.T @ present.residual
+    x = _Normals(gram, right, fitted.shape[1]).solve(_variance(present, X, gram, right, fitted.shape[1]))
+    ends = np.cumsum([fitted.shape[1], *(c.shape[1] for c in columns)])
+    return [x[a:b] for a, b in pairwise(ends)]
+
+
+def _irregularity(family: Family, values: Array, angles: Array) -> float:
+    """Share of a curve's variance at the recorded angles that a few waves of any order leave."""
+    left = curve(Accepted(family, family.grid[0], values, np.zeros((0, 0))), angles)
+    left = left - np.mean(left)
+    total = float(left @ left)
+    if total == 0.0:
+        return 0.0
+    for _ in range(WAVES):
+        trials = []
+        for order in np.arange(0.25, HIGHEST_WAVE, 0.25):
+            wave = np.column_stack([np.ones(len(angles)), np.cos(order * angles), np.sin(order * angles)])
+            # normal equations: three columns, and a share of a variance needs no digits
+            rest = left - wave @ np.linalg.solve(wave.T @ wave + 1e-9 * len(angles) * np.eye(3), wave.T @ left)
+            trials.append((float(rest @ rest), order, rest))
+        left = min(trials, key=lambda t: t[0])[2]
+    return float(left @ left) / total
+
+
+LEAST_OVERLAP = np.deg2rad(120.0)
+ALIKE = 0.75
+
+
+def likenesses(accepted: Sequence[Accepted], angles: Sequence[Array]) -> tuple[Likeness, ...]:
+    """For each curve the earlier one that it resembles most, turned and maybe reversed; slow waves do not count.
+
+    Parameters
+    ----------
+    angles : recorded angles of the joint of each curve, rad: a curve is compared only where it was measured.
+    """
+    steps = 720
+    grid = 2.0 * np.pi * np.arange(steps) / steps
+    curves, known = [], []
+    for item, q in zip(accepted, angles, strict=True):
+        seen = np.zeros(steps, dtype=bool)
+        at = np.round((q % (2.0 * np.pi)) / (2.0 * np.pi) * steps).astype(int)
+        for shift in range(-4, 5):
+            seen[(at + shift) % steps] = True
+        y = curve(item, grid)
+        slow = np.column_stack([np.ones(steps), *(f(m * grid) for m in (1, 2) for f in (np.cos, np.sin))])
+        y = y - slow @ np.linalg.lstsq(slow[seen], y[seen], rcond=1e-6)[0]
+        curves.append(y)
+        known.append(seen)
+    found = []
+    for j in range(1, len(curves)):
+        best: Likeness | None = None
+        for i in range(j):
+            for sense in (1, -1):
+                # curve j at q against sense * curve i at sense * q + shift
+                index = (sense * np.arange(steps)) % steps
+                for shift in range(steps):
+                    there = (index + shift) % steps
+                    both = known[j] & known[i][there]
+                    overlap = float(both.sum()) * 2.0 * np.pi / steps
+                    if overlap < LEAST_OVERLAP:
+                        continue
+                    a, b = curves[j][both], sense * curves[i][there][both]
+                    r = float(a @ b) / max(float(np.sqrt((a @ a) * (b @ b))), 1e-300)
+                    if r > ALIKE and (best is None or r > best.correlation):
+                        best = Likeness(
+                            accepted[j].family.where,
+                            accepted[i].family.where,
+                            sense,
+                            shift * 2.0 * np.pi / steps,
+                            r,
+                            overlap,
+                        )
+        if best is not None:
+            found.append(best)
+    return tuple(found)
