@@ -13,9 +13,11 @@ from pipeline.calibrated import Calibrated, with_folded_cell
 from pipeline.campaign import Campaign
 from pipeline.common_errors import common_errors
 from pipeline.image_findings import images_of
+from pipeline.json_io import write_json
+from pipeline.messages import LOG
 from pipeline.moved_cameras import with_station_moves
 from pipeline.poses_table import Poses
-from pipeline.runs import Run, write_json
+from pipeline.runs import Run
 from pipeline.stages.base import Context, Outcome, Stage, no_files
 from pipeline.stages.corrections import corrected
 from pipeline.stages.evidence import evidence_of
@@ -105,7 +107,7 @@ def work(context: Context) -> Outcome:
         tied,
         verify,
         settings_beside(settings_of(campaign), [f for f in images.findings if f not in images.taken_back]),
-        context.messages.info,
+        LOG.info,
         optional_parameters(found),
     )
     outputs = [run.diagnosis]
