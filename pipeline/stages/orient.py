@@ -254,7 +254,7 @@ STAGE = Stage(
         "robcal/diagnosis",
         "robcal/photogrammetry",
         "robcal/robot",
-        "robcal/least_squares.py",
+        "robcal/estimation",
         "robcal/transforms.py",
         "pipeline/image_findings.py",
         "pipeline/moved_cameras.py",
