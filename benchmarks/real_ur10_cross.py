@@ -23,9 +23,9 @@ from robcal import transforms as tf
 from robcal.calibration.identification import identify
 from robcal.calibration.observations import FrameObservations
 from robcal.calibration.verification import fit_nominal
-from robcal.diagnosis.curves import likenesses
-from robcal.diagnosis.empirical import CURVE_PRIOR, periodic_curve
-from robcal.diagnosis.fitting import Accepted
+from robcal.diagnosis.core.fitting import Accepted
+from robcal.diagnosis.search.curves import likenesses
+from robcal.physics.empirical import CURVE_PRIOR, periodic_curve
 from robcal.physics.site import Joint
 from robcal.robot.kernel import Kernel
 from robcal.robot.model import RobotModel

@@ -20,9 +20,9 @@ from benchmarks.robots import table
 from robcal import transforms as tf
 from robcal.calibration.identification import identify
 from robcal.calibration.observations import FrameObservations
+from robcal.diagnosis.core.recording import Recording
+from robcal.diagnosis.core.result import Diagnosis
 from robcal.diagnosis.diagnose import diagnose
-from robcal.diagnosis.recording import Recording
-from robcal.diagnosis.result import Diagnosis
 from robcal.robot.kernel import Kernel
 
 

@@ -82,9 +82,9 @@ def library(folder: Path, tables: Mapping[str, Path]) -> Answer:
     from pipeline.stages.diagnose import optional_parameters, own_elasticities
     from pipeline.stages.identify import identify_recording, options_of, require_robot
     from pipeline.stages.observations import build_recording
-    from robcal.diagnosis.contract import as_contract
+    from robcal.diagnosis.content import as_contract
+    from robcal.diagnosis.core.recording import Recording
     from robcal.diagnosis.diagnose import diagnose
-    from robcal.diagnosis.recording import Recording
     from robcal.robot.kernel import Kernel
 
     start = time.process_time()  # of this one core, whatever else runs on the machine

@@ -164,7 +164,7 @@ def _fitted(folder: Path, run: Any) -> Any:
     from pipeline.campaign import read_campaign
     from pipeline.stages.diagnose import own_elasticities, recording_for_diagnosis
     from pipeline.stages.identify import load_identification, require_robot
-    from robcal.diagnosis.fitting import fit
+    from robcal.diagnosis.core.fitting import fit
 
     campaign = read_campaign(folder)
     _, poses = require_robot(campaign)

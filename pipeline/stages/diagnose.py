@@ -25,17 +25,17 @@ from pipeline.tables import write_table
 from robcal.calibration.identifiability import weak_parameters
 from robcal.calibration.identification import IdentifiedRobot
 from robcal.calibration.observations import FrameObservations
-from robcal.diagnosis.contract import as_contract, with_images
+from robcal.diagnosis.content import as_contract, with_images
+from robcal.diagnosis.core.fitting import Accepted, Fit, fit
+from robcal.diagnosis.core.recording import Recording
+from robcal.diagnosis.core.result import Diagnosis
 from robcal.diagnosis.diagnose import diagnose
-from robcal.diagnosis.fitting import Accepted, Fit, fit
 from robcal.diagnosis.images.diagnosis import ImageFinding
-from robcal.diagnosis.recording import Recording
-from robcal.diagnosis.result import Diagnosis
-from robcal.diagnosis.selection import SelectionSettings
+from robcal.diagnosis.search.selection import SelectionSettings
 from robcal.photogrammetry.core.bodies import Body
 from robcal.photogrammetry.measure.measured_points import MeasuredPoints
 from robcal.photogrammetry.station.network import StationOrientation
-from robcal.physics.usual import DEVIATION
+from robcal.physics.prior_scale import DEVIATION
 from robcal.transforms import Array
 
 NAME = "diagnose"

@@ -10,8 +10,8 @@ import numpy as np
 from pipeline.poses_table import Poses
 from pipeline.stages.observations import RobotObservations, RobotRecording
 from robcal.calibration.observations import DistanceObservations, FrameObservations
-from robcal.diagnosis.recording import Recording, observation_data
-from robcal.diagnosis.result import Diagnosis
+from robcal.diagnosis.core.recording import Recording, observation_data
+from robcal.diagnosis.core.result import Diagnosis
 from robcal.robot.kernel import Kernel
 from robcal.transforms import Array, retract
 

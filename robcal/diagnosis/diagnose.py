@@ -8,23 +8,23 @@ from dataclasses import replace
 
 import numpy as np
 
-from robcal.diagnosis.analysis import Analysis, analyse
-from robcal.diagnosis.curves import LEAST_POSES, Curves, find_curves, nested_errors
-from robcal.diagnosis.fitting import Accepted, Fit, fit, pseudo_covariance
-from robcal.diagnosis.heldout import cross_validated, folds, noise_floor, position_errors, rms
-from robcal.diagnosis.naming import rivals, signature
+from robcal.diagnosis.core.fitting import Accepted, Fit, fit, pseudo_covariance
+from robcal.diagnosis.core.recording import Recording, observation_data
+from robcal.diagnosis.core.result import Diagnosis, Finding, Rival
+from robcal.diagnosis.gain.heldout import cross_validated, folds, noise_floor, position_errors, rms
+from robcal.diagnosis.gain.region import region_errors
 from robcal.diagnosis.next_poses import separating_poses
-from robcal.diagnosis.noise import estimate_noise
-from robcal.diagnosis.recording import Recording, observation_data
-from robcal.diagnosis.region import region_errors
-from robcal.diagnosis.result import Diagnosis, Finding, Rival
-from robcal.diagnosis.scan import orthonormal_basis
-from robcal.diagnosis.selection import Selection, SelectionSettings, poses_that_carry, select
-from robcal.diagnosis.swaps import find_swaps, relabelled
-from robcal.diagnosis.unloaded import unloaded_elasticities
-from robcal.physics.family import Array, ObservationData, numeric_sigma
+from robcal.diagnosis.noise.components import estimate_noise
+from robcal.diagnosis.noise.swaps import find_swaps, relabelled
+from robcal.diagnosis.scan.analysis import Analysis, analyse
+from robcal.diagnosis.scan.posterior import rivals, signature
+from robcal.diagnosis.scan.statistics import orthonormal_basis
+from robcal.diagnosis.search.curves import LEAST_POSES, Curves, find_curves, nested_errors
+from robcal.diagnosis.search.selection import Selection, SelectionSettings, poses_that_carry, select
+from robcal.diagnosis.search.unloaded import unloaded_elasticities
+from robcal.physics.cause import Array, ObservationData, numeric_sigma
 from robcal.physics.measuring import describe, swapped
-from robcal.physics.usual import usual_size
+from robcal.physics.prior_scale import usual_size
 from robcal.robot.model import RobotModel
 
 DEFAULTS = SelectionSettings()

@@ -12,13 +12,13 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from robcal.diagnosis.candidates import Tangents, tangents
-from robcal.diagnosis.fitting import Accepted, Fit, fit
-from robcal.diagnosis.heldout import cross_validated, folds, position_errors
-from robcal.diagnosis.recording import Recording
-from robcal.diagnosis.result import Diagnosis, Finding
-from robcal.diagnosis.swaps import find_swaps, relabelled
-from robcal.physics.family import Array, Basis, Constants
+from robcal.diagnosis.core.fitting import Accepted, Fit, fit
+from robcal.diagnosis.core.recording import Recording
+from robcal.diagnosis.core.result import Diagnosis, Finding
+from robcal.diagnosis.gain.heldout import cross_validated, folds, position_errors
+from robcal.diagnosis.noise.swaps import find_swaps, relabelled
+from robcal.diagnosis.scan.tangents import Tangents, tangents
+from robcal.physics.cause import Array, Basis, Constants
 from robcal.robot.model import RobotModel
 from robcal.robot.terms import identifier, names_in
 

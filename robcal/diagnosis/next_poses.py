@@ -6,10 +6,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from robcal.diagnosis.fitting import Fit
-from robcal.diagnosis.recording import Recording
-from robcal.diagnosis.result import Finding
-from robcal.physics.family import Array, Constants, Family
+from robcal.diagnosis.core.fitting import Fit
+from robcal.diagnosis.core.recording import Recording
+from robcal.diagnosis.core.result import Finding
+from robcal.physics.cause import Array, Constants, Family
 from robcal.robot.kernel import PoseInputs
 from robcal.robot.model import RobotModel
 

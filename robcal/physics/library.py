@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from robcal.physics.family import Family, ObservationData
+from robcal.physics.cause import Family, ObservationData
 from robcal.physics.joint import joint_families
 from robcal.physics.measuring import measuring_families
 from robcal.physics.site import RobotSite

@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from robcal.physics.family import DEG, Array, Constants, Family, ObservationData
+from robcal.physics.cause import DEG, Array, Constants, Family, ObservationData
 from robcal.physics.refraction import refraction_families
 from robcal.physics.site import breaks
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from robcal.physics.family import Array, Constants, Family, ObservationData
+from robcal.physics.cause import Array, Constants, Family, ObservationData
 
 STEP = 1e-3
 """Metres over which the field is differentiated: it is a polynomial of the second degree, so any will do."""

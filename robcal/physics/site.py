@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from robcal.physics.family import DEG, Array
-from robcal.physics.usual import DEFLECTION, LEAST_MOMENT
+from robcal.physics.cause import DEG, Array
+from robcal.physics.prior_scale import DEFLECTION, LEAST_MOMENT
 from robcal.robot.model import RobotModel
 
 ANGLE_OF_AXIS = {"x": "roll", "y": "pitch", "z": "yaw"}

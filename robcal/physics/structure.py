@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from robcal.physics.family import DEG, PER_KNM, Array, Basis, Constants, Family, Report
+from robcal.physics.cause import DEG, PER_KNM, Array, Basis, Constants, Family, Report
+from robcal.physics.prior_scale import LEAST_MOMENT
 from robcal.physics.site import LETTER_OF_KIND, Joint, RobotSite, breaks, exponential_law
-from robcal.physics.usual import LEAST_MOMENT
 from robcal.robot.terms import identifier
 
 

@@ -16,7 +16,7 @@ from pipeline.stages.diagnose import recording_for_diagnosis
 from pipeline.stages.identify import identify_recording, options_of, require_robot
 from pipeline.stages.observations import build_recording
 from robcal.calibration.identification import IdentifiedRobot
-from robcal.diagnosis.recording import Recording
+from robcal.diagnosis.core.recording import Recording
 from robcal.robot.kernel import Kernel
 
 

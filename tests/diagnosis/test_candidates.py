@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from robcal.diagnosis.candidates import tangents
-from robcal.diagnosis.fitting import fit
+from robcal.diagnosis.core.fitting import fit
+from robcal.diagnosis.scan.tangents import tangents
 from robcal.physics.library import all_families
 from robcal.physics.site import RobotSite
 from tests.diagnosis.recordings import concealed

@@ -8,11 +8,11 @@ import pytest
 from robcal import transforms as tf
 from robcal.calibration.identification import identify
 from robcal.calibration.observations import FrameObservations
-from robcal.diagnosis.curves import LEAST_POSES, curve, find_curves, likenesses, nested_errors
+from robcal.diagnosis.core.fitting import Accepted, Fit, fit, terms_of
+from robcal.diagnosis.core.recording import Recording
 from robcal.diagnosis.diagnose import diagnose
-from robcal.diagnosis.empirical import periodic_curve
-from robcal.diagnosis.fitting import Accepted, Fit, fit, terms_of
-from robcal.diagnosis.recording import Recording
+from robcal.diagnosis.search.curves import LEAST_POSES, curve, find_curves, likenesses, nested_errors
+from robcal.physics.empirical import periodic_curve
 from robcal.physics.site import Joint
 from robcal.robot.kernel import Kernel
 from tests.calibration.scenarios import Scenario, scenario

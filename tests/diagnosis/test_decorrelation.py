@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from robcal.diagnosis.decorrelation import CommonNoise, SharedNoise
+from robcal.diagnosis.core.decorrelation import CommonNoise, SharedNoise
 
 
 def test_shared_errors_become_white_and_come_back() -> None:

@@ -12,11 +12,11 @@ import pytest
 
 from pipeline.stages.diagnose import own_elasticities
 from robcal.calibration.observations import PointObservations
-from robcal.diagnosis.contract import as_contract
+from robcal.diagnosis.content import as_contract
+from robcal.diagnosis.core.fitting import Accepted
+from robcal.diagnosis.core.result import Diagnosis
 from robcal.diagnosis.diagnose import diagnose, told_through
-from robcal.diagnosis.fitting import Accepted
-from robcal.diagnosis.result import Diagnosis
-from robcal.physics.family import Family
+from robcal.physics.cause import Family
 from robcal.transforms import exp_so3
 from tests.diagnosis.recordings import concealed
 

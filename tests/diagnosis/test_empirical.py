@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robcal.diagnosis.empirical import LEAST_IN_BUMP, REACH, empirical_families, spoken
-from robcal.physics.family import Family
+from robcal.physics.cause import Family
+from robcal.physics.empirical import LEAST_IN_BUMP, REACH, empirical_families, spoken
 from robcal.physics.site import RobotSite
 from robcal.robot.model import Frame, RobotModel
 from robcal.robot.terms import evaluate

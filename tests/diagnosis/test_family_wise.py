@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from robcal.diagnosis.family_wise import simulate, tails
-from robcal.diagnosis.scan import Entry, orthonormal_basis, remove, scan, stack_entries
+from robcal.diagnosis.scan.family_wise import simulate, tails
+from robcal.diagnosis.scan.statistics import Entry, orthonormal_basis, remove, scan, stack_entries
 
 ROWS, FREEDOM = 300, 4.5
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from robcal.calibration.observations import DistanceObservations
-from robcal.diagnosis import fitting
+from robcal.diagnosis.core import fitting
+from robcal.diagnosis.core.fitting import Accepted, fit
 from robcal.diagnosis.diagnose import recording_data
-from robcal.diagnosis.fitting import Accepted, fit
-from robcal.diagnosis.heldout import position_errors, rms
+from robcal.diagnosis.gain.heldout import position_errors, rms
 from robcal.physics.measuring import measuring_families
 from tests.diagnosis.recordings import concealed
 

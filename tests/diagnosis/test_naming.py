@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import special
 
-from robcal.diagnosis.naming import posterior
-from robcal.diagnosis.scan import ScanResult
-from robcal.physics.family import Family
+from robcal.diagnosis.scan.posterior import posterior
+from robcal.diagnosis.scan.statistics import ScanResult
+from robcal.physics.cause import Family
 
 BLANK = Family("backlash", "robot", "axis1", "z", ("width",), (1e-4,), lambda v, c: {}, "")
 

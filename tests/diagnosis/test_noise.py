@@ -10,8 +10,8 @@ import pytest
 
 from fixtures.plan import Noise as Measured
 from robcal.calibration.noise import restricted_components
-from robcal.diagnosis.noise import estimate_noise
-from robcal.diagnosis.recording import Recording
+from robcal.diagnosis.core.recording import Recording
+from robcal.diagnosis.noise.components import estimate_noise
 from tests.diagnosis.recordings import concealed
 
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.stages.diagnose import optional_parameters, own_elasticities
+from robcal.diagnosis.core.fitting import fit
 from robcal.diagnosis.diagnose import diagnose
-from robcal.diagnosis.fitting import fit
-from robcal.diagnosis.region import SHARE, extrapolated, outermost, region_errors
+from robcal.diagnosis.gain.region import SHARE, extrapolated, outermost, region_errors
 from tests.diagnosis.recordings import concealed
 
 

@@ -7,9 +7,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from robcal.diagnosis.blunders import worst_group
-from robcal.diagnosis.family_wise import simulate
-from robcal.diagnosis.scan import Entry, log_bayes_factor, orthonormal_basis, remove, restack, scan, stack_entries
+from robcal.diagnosis.noise.blunders import worst_group
+from robcal.diagnosis.scan.family_wise import simulate
+from robcal.diagnosis.scan.statistics import (
+    Entry,
+    log_bayes_factor,
+    orthonormal_basis,
+    remove,
+    restack,
+    scan,
+    stack_entries,
+)
 
 ROWS, PARAMETERS = 120, 12
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from robcal.calibration.observations import PointObservations
-from robcal.diagnosis.recording import Recording
-from robcal.diagnosis.swaps import find_swaps, relabelled
+from robcal.diagnosis.core.recording import Recording
+from robcal.diagnosis.noise.swaps import find_swaps, relabelled
 from robcal.transforms import frame_from_xyzrpy, transform
 
 BODY = np.array([[0, 0, 0], [0.4, 0.02, 0], [0.38, 0.3, 0.02], [-0.03, 0.33, 0.05], [0.2, 0.12, 0.11]])

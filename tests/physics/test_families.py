@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from robcal.diagnosis.analysis import acts_once
-from robcal.physics.family import Basis, numeric_sigma
+from robcal.diagnosis.scan.analysis import acts_once
+from robcal.physics.cause import Basis, numeric_sigma
 from robcal.physics.joint import joint_families
 from robcal.physics.measuring import describe
 from robcal.physics.site import RobotSite, exponential_law

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from robcal.physics.family import ObservationData
+from robcal.physics.cause import ObservationData
 from robcal.physics.measuring import measuring_families
 from robcal.transforms import frame_from_xyzrpy
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from robcal.physics.usual import DEFLECTION, DEVIATION, usual_size, usual_sizes
+from robcal.physics.prior_scale import DEFLECTION, DEVIATION, usual_size, usual_sizes
 
 
 def test_an_elasticity_is_measured_by_the_largest_load() -> None:

@@ -22,7 +22,7 @@ from pipeline.stages.diagnose import settings_beside
 from pipeline.stages.identify import load_identification
 from robcal.diagnosis.images.camera_moves import epochs_of
 from robcal.diagnosis.images.diagnosis import ImageFinding
-from robcal.diagnosis.selection import SelectionSettings
+from robcal.diagnosis.search.selection import SelectionSettings
 
 PLAN = {"seed": 21, "robot": "ur10", "poses": 50, "verify": 10, "kept_out": 30}
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from robcal.physics.family import Array
+from robcal.physics.cause import Array
 
 
 @dataclass(frozen=True)

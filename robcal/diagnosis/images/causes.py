@@ -14,7 +14,7 @@ from robcal.diagnosis.images.data import ImageData
 from robcal.diagnosis.images.refraction import refraction_causes
 from robcal.photogrammetry.core.camera import project_with_jacobians
 from robcal.photogrammetry.core.eccentricity import centre_shift
-from robcal.physics.family import Array
+from robcal.physics.cause import Array
 
 DEG = float(np.degrees(1.0))
 FIELD_DEGREE = 5

@@ -11,7 +11,7 @@ from robcal.photogrammetry.bundle.operator import NetworkOperator
 from robcal.photogrammetry.core.camera import Camera
 from robcal.photogrammetry.core.eccentricity import body_normals
 from robcal.photogrammetry.core.network import CameraNetwork, Lengths
-from robcal.physics.family import Array
+from robcal.physics.cause import Array
 from robcal.transforms import transform
 
 LENS_TERMS = frozenset({"k1", "k2", "k3", "p1", "p2", "affinity"})

@@ -8,12 +8,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import stats
 
-from robcal.diagnosis.family_wise import FamilyWise, simulate
 from robcal.diagnosis.images.cause import ImageCause
 from robcal.diagnosis.images.causes import image_causes, neighbouring_moves
 from robcal.diagnosis.images.data import ImageData
-from robcal.diagnosis.scan import Entry, ScanResult, Stack, log_f_probability, orthonormal_basis, scan, stack_entries
-from robcal.physics.family import Array, Constants, numeric_sigma
+from robcal.diagnosis.scan.family_wise import FamilyWise, simulate
+from robcal.diagnosis.scan.statistics import (
+    Entry,
+    ScanResult,
+    Stack,
+    log_f_probability,
+    orthonormal_basis,
+    scan,
+    stack_entries,
+)
+from robcal.physics.cause import Array, Constants, numeric_sigma
 
 LEVEL = 0.002
 """Family-wise level. Marks share small errors that their covariance does not know, and a robot's own diagnosis adds its

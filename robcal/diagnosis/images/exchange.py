@@ -12,7 +12,7 @@ from robcal.diagnosis.images.diagnosis import ImageFinding
 from robcal.photogrammetry.core.bodies import Body
 from robcal.photogrammetry.core.camera import project
 from robcal.photogrammetry.station.network import StationMarks, StationOrientation
-from robcal.physics.family import Array
+from robcal.physics.cause import Array
 from robcal.transforms import invert, transform
 
 LEAST_MARKS = 5

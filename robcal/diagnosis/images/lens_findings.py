@@ -14,7 +14,7 @@ from robcal.photogrammetry.core.bodies import Body
 from robcal.photogrammetry.core.camera import INTRINSIC_NAMES, Camera
 from robcal.photogrammetry.core.network import CameraNetwork
 from robcal.photogrammetry.station.network import Evidence, StationOrientation
-from robcal.physics.family import Array
+from robcal.physics.cause import Array
 
 LENS_GROUPS: Mapping[str, tuple[str, ...]] = {
     "lens_radial": ("k1", "k2", "k3"),

@@ -9,7 +9,7 @@ import numpy as np
 from robcal.diagnosis.images.cause import ImageCause, only
 from robcal.diagnosis.images.data import ImageData
 from robcal.photogrammetry.core.camera import project_with_jacobians
-from robcal.physics.family import Array
+from robcal.physics.cause import Array
 
 GLASS = 1.52
 TILTS = (0.0, 0.3, 0.6)

@@ -12,8 +12,8 @@ from pipeline.campaign import Campaign
 from pipeline.stages.identify import options_of, require_robot
 from pipeline.stages.observations import RobotRecording, frame_observations
 from robcal.calibration.identification import identify
+from robcal.diagnosis.core.recording import Recording
 from robcal.diagnosis.next_poses import poses_table, row_of
-from robcal.diagnosis.recording import Recording
 from robcal.errors import RobcalError
 from robcal.photogrammetry.measure.frames import measure_frames
 from robcal.photogrammetry.measure.points import measure_points

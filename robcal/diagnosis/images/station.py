@@ -13,7 +13,7 @@ from scipy import linalg, sparse, stats
 
 from robcal.diagnosis.images.data import LENS_TERMS, ImageData
 from robcal.diagnosis.images.diagnosis import spread_of_others
-from robcal.diagnosis.scan import orthonormal_basis
+from robcal.diagnosis.scan.statistics import orthonormal_basis
 from robcal.photogrammetry.core.bodies import Body
 from robcal.photogrammetry.core.camera import Camera
 from robcal.photogrammetry.core.grouping import sum_by
@@ -22,7 +22,7 @@ from robcal.photogrammetry.station.network import StationDesign, StationOrientat
 from robcal.photogrammetry.station.scan import scan_moves
 from robcal.photogrammetry.station.start import exchanged
 from robcal.photogrammetry.station.state import body_weight
-from robcal.physics.family import Array
+from robcal.physics.cause import Array
 from robcal.transforms import invert, transform
 
 FROM_FILE = 0.1

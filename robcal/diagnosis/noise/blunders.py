@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from robcal.diagnosis.scan import log_f_probability
-from robcal.physics.family import Array
+from robcal.diagnosis.scan.statistics import log_f_probability
+from robcal.physics.cause import Array
 
 BLUNDER_SIGNAL = 30.0
 """Prior size of a gross error in units of sigma."""

@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from robcal.physics.family import Array
+from robcal.physics.cause import Array
 
 
 @dataclass(frozen=True)

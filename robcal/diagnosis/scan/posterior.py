@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from scipy import optimize, special
 
-from robcal.diagnosis.candidates import Tangents
-from robcal.diagnosis.result import Rival
-from robcal.diagnosis.scan import Entry, ScanResult, Stack, log_bayes_factor, stack_entries
-from robcal.physics.family import Array, Constants, Family
+from robcal.diagnosis.core.result import Rival
+from robcal.diagnosis.scan.statistics import Entry, ScanResult, Stack, log_bayes_factor, stack_entries
+from robcal.diagnosis.scan.tangents import Tangents
+from robcal.physics.cause import Array, Constants, Family
 
 SAME_SIGNATURE = 0.98
 """Share of the named signature that a rival must reproduce to be called indistinguishable."""

@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from robcal.calibration.noise import restricted_components
-from robcal.diagnosis.decorrelation import SharedNoise
-from robcal.diagnosis.fitting import Accepted, Fit, fit
-from robcal.diagnosis.recording import Recording
-from robcal.physics.family import Array
+from robcal.diagnosis.core.decorrelation import SharedNoise
+from robcal.diagnosis.core.fitting import Accepted, Fit, fit
+from robcal.diagnosis.core.recording import Recording
+from robcal.physics.cause import Array
 from robcal.robot.model import RobotModel
 
 

@@ -7,15 +7,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from robcal.diagnosis.blunders import Suspect, worst_group
-from robcal.diagnosis.candidates import Tangents, entries, tangents
-from robcal.diagnosis.empirical import empirical_families
-from robcal.diagnosis.family_wise import FamilyWise, simulate, tails
-from robcal.diagnosis.fitting import Accepted, Fit
-from robcal.diagnosis.naming import Posterior, posterior
-from robcal.diagnosis.recording import Recording
-from robcal.diagnosis.scan import ScanResult, Stack, orthonormal_basis, restack, scan, stack_entries
-from robcal.physics.family import Array, Constants, Family, ObservationData
+from robcal.diagnosis.core.fitting import Accepted, Fit
+from robcal.diagnosis.core.recording import Recording
+from robcal.diagnosis.noise.blunders import Suspect, worst_group
+from robcal.diagnosis.scan.family_wise import FamilyWise, simulate, tails
+from robcal.diagnosis.scan.posterior import Posterior, posterior
+from robcal.diagnosis.scan.statistics import ScanResult, Stack, orthonormal_basis, restack, scan, stack_entries
+from robcal.diagnosis.scan.tangents import Tangents, entries, tangents
+from robcal.physics.cause import Array, Constants, Family, ObservationData
+from robcal.physics.empirical import empirical_families
 from robcal.physics.library import all_families
 from robcal.physics.site import RobotSite
 

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from robcal.calibration.observations import DistanceObservations, FrameObservations, PointObservations
-from robcal.diagnosis.fitting import Accepted, Fit, solve
-from robcal.diagnosis.recording import Recording, observation_data
-from robcal.physics.family import Array
+from robcal.diagnosis.core.fitting import Accepted, Fit, solve
+from robcal.diagnosis.core.recording import Recording, observation_data
+from robcal.physics.cause import Array
 from robcal.transforms import invert, transform
 
 FOLDS = 8

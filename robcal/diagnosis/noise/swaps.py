@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from robcal.calibration.observations import PointObservations
-from robcal.diagnosis.recording import Recording
-from robcal.physics.family import Array
+from robcal.diagnosis.core.recording import Recording
+from robcal.physics.cause import Array
 
 LEAST_DEVIATION = 1e-3
 """Metres: mean length deviations below this are no matter of numbers."""

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from robcal.physics.family import Array, Basis, Constants, Family
+from robcal.physics.cause import Array, Basis, Constants, Family
 from robcal.physics.site import LETTER_OF_KIND, Joint, RobotSite
 from robcal.robot.terms import identifier
 

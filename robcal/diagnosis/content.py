@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+from robcal.diagnosis.core.result import Diagnosis, Finding
 from robcal.diagnosis.images.diagnosis import ImageDiagnosis, ImageFinding
 from robcal.diagnosis.next_poses import poses_table
-from robcal.diagnosis.result import Diagnosis, Finding
 
 OF_STATION = frozenset({"camera_moved", "scale_drift", "scale_error"})
 """Causes of cameras that 3D points show only for the station as a whole."""

@@ -14,13 +14,13 @@ from itertools import pairwise
 
 import numpy as np
 
-from robcal.diagnosis.candidates import tangents
-from robcal.diagnosis.empirical import periodic_curve
-from robcal.diagnosis.fitting import Accepted, Fit
-from robcal.diagnosis.heldout import folds, rms
-from robcal.diagnosis.recording import Recording
-from robcal.diagnosis.scan import log_f_probability
-from robcal.physics.family import Array, Family
+from robcal.diagnosis.core.fitting import Accepted, Fit
+from robcal.diagnosis.core.recording import Recording
+from robcal.diagnosis.gain.heldout import folds, rms
+from robcal.diagnosis.scan.statistics import log_f_probability
+from robcal.diagnosis.scan.tangents import tangents
+from robcal.physics.cause import Array, Family
+from robcal.physics.empirical import periodic_curve
 from robcal.physics.site import RobotSite
 from robcal.robot.model import Term
 

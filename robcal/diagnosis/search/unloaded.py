@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from robcal.diagnosis.recording import Recording
+from robcal.diagnosis.core.recording import Recording
 from robcal.robot.kernel_cache import kernel_of
 from robcal.robot.model import RobotModel
 from robcal.robot.terms import identifier

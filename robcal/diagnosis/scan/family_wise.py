@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from robcal.diagnosis.scan import Fitted, Stack, log_f_probability, remove
-from robcal.physics.family import Array
+from robcal.diagnosis.scan.statistics import Fitted, Stack, log_f_probability, remove
+from robcal.physics.cause import Array
 
 CLEAR = 3.0
 """Standard deviations of the fourth moment of Gaussian residuals above which tails are long."""

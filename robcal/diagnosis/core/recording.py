@@ -14,9 +14,9 @@ from robcal.calibration.observations import (
     PointObservations,
     SensorPointObservations,
 )
-from robcal.diagnosis.decorrelation import CommonNoise, SharedNoise
+from robcal.diagnosis.core.decorrelation import CommonNoise, SharedNoise
 from robcal.errors import InvalidInput
-from robcal.physics.family import Array, ObservationData
+from robcal.physics.cause import Array, ObservationData
 from robcal.robot.kernel import Kernel, PoseInputs
 from robcal.transforms import transform
 

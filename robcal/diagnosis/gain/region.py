@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from robcal.diagnosis.fitting import Fit, damping, solve
-from robcal.diagnosis.heldout import rms
-from robcal.diagnosis.recording import Recording
-from robcal.physics.family import Array
+from robcal.diagnosis.core.fitting import Fit, damping, solve
+from robcal.diagnosis.core.recording import Recording
+from robcal.diagnosis.gain.heldout import rms
+from robcal.physics.cause import Array
 
 SHARE = 0.2
 """Share of the poses that lie in the region."""

@@ -11,15 +11,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from robcal.diagnosis.analysis import Analysis, accepted_from, analyse, extend
-from robcal.diagnosis.family_wise import FamilyWise
-from robcal.diagnosis.fitting import Accepted, Fit, fit
-from robcal.diagnosis.naming import refine
-from robcal.diagnosis.noise import estimate_noise
-from robcal.diagnosis.recording import Recording
-from robcal.diagnosis.scan import orthonormal_basis
-from robcal.physics.family import Array, Constants, Family, Key
-from robcal.physics.usual import usual_size
+from robcal.diagnosis.core.fitting import Accepted, Fit, fit
+from robcal.diagnosis.core.recording import Recording
+from robcal.diagnosis.noise.components import estimate_noise
+from robcal.diagnosis.scan.analysis import Analysis, accepted_from, analyse, extend
+from robcal.diagnosis.scan.family_wise import FamilyWise
+from robcal.diagnosis.scan.posterior import refine
+from robcal.diagnosis.scan.statistics import orthonormal_basis
+from robcal.physics.cause import Array, Constants, Family, Key
+from robcal.physics.prior_scale import usual_size
 from robcal.robot.model import RobotModel
 
 SAME_SCATTER = 0.2

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import special, stats
 
-from robcal.physics.family import Array
+from robcal.physics.cause import Array
 
 PRIOR_SCALES = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0)
 """Sizes of the prior amplitude over which the evidence is averaged."""

@@ -8,10 +8,10 @@ from functools import cached_property
 
 import numpy as np
 
-from robcal.diagnosis.fitting import Fit
-from robcal.diagnosis.recording import Recording, observation_data
-from robcal.diagnosis.scan import Entry
-from robcal.physics.family import Array, Basis, Constants, Family, ObservationData
+from robcal.diagnosis.core.fitting import Fit
+from robcal.diagnosis.core.recording import Recording, observation_data
+from robcal.diagnosis.scan.statistics import Entry
+from robcal.physics.cause import Array, Basis, Constants, Family, ObservationData
 from robcal.robot.terms import names_in
 
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from robcal.physics.family import Array
+from robcal.physics.cause import Array
 from robcal.robot.terms import identifier
 
 DEVIATION = 1e-3

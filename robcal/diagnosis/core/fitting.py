@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from robcal.diagnosis.recording import Recording, observation_data
-from robcal.diagnosis.scan import orthonormal_basis
-from robcal.physics.family import Array, Constants, Family
-from robcal.physics.usual import usual_sizes
+from robcal.diagnosis.core.recording import Recording, observation_data
+from robcal.diagnosis.scan.statistics import orthonormal_basis
+from robcal.physics.cause import Array, Constants, Family
+from robcal.physics.prior_scale import usual_sizes
 from robcal.robot.kernel import Kernel, PoseInputs
 from robcal.robot.kernel_cache import kernel_of
 from robcal.robot.model import RobotModel, Term

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from robcal.physics.family import Array, Constants, Family
+from robcal.physics.cause import Array, Constants, Family
 from robcal.robot.model import RobotModel
 
 

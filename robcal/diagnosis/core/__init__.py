@@ -1,0 +1,1 @@
+"""What a diagnosis works on: recordings, their correlations, the fit, the result."""

@@ -1,0 +1,1 @@
+"""What causes gain on data kept out."""

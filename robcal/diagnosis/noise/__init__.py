@@ -1,0 +1,1 @@
+"""Before physics: variance components, gross errors, exchanged numbers."""

@@ -1,0 +1,1 @@
+"""All candidates tested and ranked at one fit."""

@@ -1,0 +1,1 @@
+"""Step by step from a scan to the causes that are accepted."""
