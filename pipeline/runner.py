@@ -17,7 +17,7 @@ from pipeline.messages import Messages
 from pipeline.runs import RUN_FORMAT, Run, StageRecord, code_version, fingerprint, read_json, run_file, write_json
 from pipeline.schemas import proposal
 from pipeline.stages.base import Context, Outcome, Stage
-from pipeline.stages.joint_log import check_joint_limits
+from pipeline.stages.identify import check_joint_limits
 from pipeline.stages.registry import STAGES
 from robcal.errors import InvalidInput, RobcalError
 
