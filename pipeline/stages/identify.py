@@ -147,7 +147,7 @@ STAGE = Stage(
     code=(
         "robcal/calibration",
         "robcal/robot",
-        "robcal/least_squares.py",
+        "robcal/estimation",
         "robcal/transforms.py",
         "pipeline/stages/identify.py",
         "pipeline/stages/observations.py",

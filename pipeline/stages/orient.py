@@ -65,9 +65,8 @@ def work(context: Context) -> Outcome:
         sizes={name: _size(campaign.cameras[name], run, name) for name in marks},
         covariates=image_covariates(campaign),
     )
-    misfit = (
-        None if campaign.robot is None else partial(robot_misfit, campaign.robot, poses, options_of(campaign, True))
-    )
+    robot = campaign.robot
+    misfit = None if robot is None else partial(robot_misfit, robot, poses, options_of(campaign, True))
     try:
         found = orient_images(images, campaign.entry.diagnosis.enabled, misfit)
     except RobcalError as error:
@@ -233,7 +232,7 @@ STAGE = Stage(
         "robcal/diagnosis",
         "robcal/photogrammetry",
         "robcal/robot",
-        "robcal/least_squares.py",
+        "robcal/estimation",
         "robcal/transforms.py",
         "robcal/recipe",
         "pipeline/adjusted_images.py",

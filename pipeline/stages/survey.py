@@ -283,7 +283,7 @@ STAGE = Stage(
     after=("detect",),
     code=(
         "robcal/photogrammetry",
-        "robcal/least_squares.py",
+        "robcal/estimation",
         "robcal/transforms.py",
         "pipeline/stages/survey.py",
         "pipeline/body_file.py",

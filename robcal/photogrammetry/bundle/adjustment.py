@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from robcal.errors import DegenerateGeometry, InvalidInput, NotIdentifiable
-from robcal.least_squares import SolveSummary
+from robcal.estimation.summary import SolveSummary
 from robcal.photogrammetry.bundle.datum import DatumWish, InnerOver, resolve_datum
 from robcal.photogrammetry.bundle.determinacy import intrinsics_basis, singular_unknowns, undetermined
 from robcal.photogrammetry.bundle.lengths import bars_scale, rows_of

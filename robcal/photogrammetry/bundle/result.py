@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from scipy import linalg
 
-from robcal.least_squares import SolveSummary
+from robcal.estimation.summary import SolveSummary
 from robcal.photogrammetry.bundle.determinacy import strong_correlations
 from robcal.photogrammetry.bundle.lengths import distances, length_results
 from robcal.photogrammetry.bundle.normals import Factor, State, build_normals, linearise
