@@ -106,14 +106,5 @@ STAGE = Stage(
     inputs=no_files,
     settings=lambda campaign: campaign.entry.diagnosis.model_dump(),
     after=("survey", "orient", "identify"),
-    code=(
-        "robcal/calibration",
-        "robcal/diagnosis",
-        "robcal/recipe",
-        "robcal/photogrammetry",
-        "robcal/physics",
-        "robcal/robot",
-        "pipeline/stages/diagnose.py",
-        "pipeline/stages/observations.py",
-    ),
+    module=__name__,
 )

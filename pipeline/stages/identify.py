@@ -144,14 +144,5 @@ STAGE = Stage(
     inputs=lambda campaign: [p for p in campaign.files if p.suffix.lower() in {".csv", ".yaml", ".yml"}],
     settings=lambda campaign: campaign.entry.model_dump(include={"model", "payloads", "measurements", "body"}),
     after=("survey", "measure", "frames"),
-    code=(
-        "robcal/calibration",
-        "robcal/robot",
-        "robcal/estimation",
-        "robcal/transforms.py",
-        "pipeline/stages/identify.py",
-        "pipeline/stages/observations.py",
-        "robcal/photogrammetry",
-        "robcal/recipe",
-    ),
+    module=__name__,
 )

@@ -227,16 +227,5 @@ STAGE = Stage(
         list(campaign.poses.names) if campaign.poses else [],
     ],
     after=("detect", "survey"),
-    code=(
-        "robcal/calibration",
-        "robcal/diagnosis",
-        "robcal/photogrammetry",
-        "robcal/robot",
-        "robcal/estimation",
-        "robcal/transforms.py",
-        "robcal/recipe",
-        "pipeline/adjusted_images.py",
-        "pipeline/stages/observations.py",
-        "pipeline/stages/orient.py",
-    ),
+    module=__name__,
 )

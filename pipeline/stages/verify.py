@@ -131,5 +131,5 @@ STAGE = Stage(
     inputs=no_files,
     settings=lambda campaign: [campaign.name, campaign.entry.model_dump(include={"model"})],
     after=("identify", "diagnose"),
-    code=("robcal/calibration", "robcal/recipe", "robcal/robot", "pipeline/stages/verify.py", "pipeline/robot_file.py"),
+    module=__name__,
 )
