@@ -201,14 +201,5 @@ STAGE = Stage(
     inputs=lambda campaign: [p for p in campaign.files if p.suffix.lower() in {".csv", ".yaml", ".yml"}],
     settings=lambda campaign: campaign.entry.model_dump(include={"model", "payloads", "measurements", "body"}),
     after=("survey", "measure", "frames"),
-    code=(
-        "robcal/calibration",
-        "robcal/robot",
-        "robcal/least_squares.py",
-        "robcal/transforms.py",
-        "pipeline/stages/identify.py",
-        "pipeline/stages/observations.py",
-        "pipeline/stages/joint_log.py",
-        "pipeline/calibrated.py",
-    ),
+    module=__name__,
 )

@@ -249,16 +249,5 @@ STAGE = Stage(
         list(campaign.poses.names) if campaign.poses else [],
     ],
     after=("detect", "survey"),
-    code=(
-        "robcal/calibration",
-        "robcal/diagnosis",
-        "robcal/photogrammetry",
-        "robcal/robot",
-        "robcal/least_squares.py",
-        "robcal/transforms.py",
-        "pipeline/image_findings.py",
-        "pipeline/moved_cameras.py",
-        "pipeline/stages/observations.py",
-        "pipeline/stages/orient.py",
-    ),
+    module=__name__,
 )

@@ -198,5 +198,5 @@ STAGE = Stage(
     inputs=no_files,
     settings=lambda campaign: [campaign.name, campaign.entry.model_dump(include={"model"})],
     after=("identify", "diagnose"),
-    code=("robcal/calibration", "robcal/robot", "pipeline/stages/verify.py", "pipeline/robot_file.py"),
+    module=__name__,
 )

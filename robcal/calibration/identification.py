@@ -23,14 +23,10 @@ from robcal.calibration.problem import CellEvaluator, Evaluator, Problem, State,
 from robcal.calibration.solution import Engine, Solution
 from robcal.calibration.start_values import candidates
 from robcal.errors import InvalidInput, NotIdentifiable
-from robcal.least_squares import (
-    Eliminated,
-    SolveSummary,
-    TerminationSettings,
-    gauss_newton,
-    global_test,
-    linear_statistics,
-)
+from robcal.estimation.covariance import global_test, linear_statistics
+from robcal.estimation.dependence import Eliminated
+from robcal.estimation.gauss_newton import gauss_newton
+from robcal.estimation.summary import SolveSummary, TerminationSettings
 from robcal.robot.kernel import Kernel, PoseInputs
 from robcal.robot.model import RobotModel
 
