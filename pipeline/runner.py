@@ -18,7 +18,7 @@ from pipeline.runs import RUN_FORMAT, Run, StageRecord, fingerprint, read_json, 
 from pipeline.schemas import proposal
 from pipeline.sources import code_version
 from pipeline.stages.base import Context, Outcome, Stage
-from pipeline.stages.joint_log import check_joint_limits
+from pipeline.stages.identify import check_joint_limits
 from pipeline.stages.registry import STAGES
 from robcal.errors import InvalidInput, RobcalError
 
