@@ -12,7 +12,6 @@ from pipeline.bodies import surveyed_or_given
 from pipeline.campaign import Campaign
 from pipeline.runs import Run
 from pipeline.tables import read_table
-from robcal.diagnosis.images.data import survey_data
 from robcal.diagnosis.images.diagnosis import ImageDiagnosis, ImageFinding, diagnose_images
 from robcal.diagnosis.images.exchange import exchanged_targets
 from robcal.diagnosis.images.lens_findings import beyond_lenses, station_findings, survey_findings
@@ -22,6 +21,7 @@ from robcal.photogrammetry.core.camera import Camera
 from robcal.photogrammetry.station.network import StationMarks, StationOrientation
 from robcal.photogrammetry.station.seen_normals import Ellipses
 from robcal.photogrammetry.survey.types import SurveyResult
+from robcal.physics.images.data import survey_data
 from robcal.transforms import Array
 
 SHAPES = "shapes"

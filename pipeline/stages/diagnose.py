@@ -25,7 +25,7 @@ from pipeline.tables import write_table
 from robcal.calibration.identifiability import weak_parameters
 from robcal.calibration.identification import IdentifiedRobot
 from robcal.calibration.observations import FrameObservations
-from robcal.diagnosis.content import as_contract, with_images
+from robcal.diagnosis.content import diagnosis_content, with_images
 from robcal.diagnosis.core.fitting import Accepted, Fit, fit
 from robcal.diagnosis.core.recording import Recording
 from robcal.diagnosis.core.result import Diagnosis
@@ -35,11 +35,11 @@ from robcal.diagnosis.search.selection import SelectionSettings
 from robcal.photogrammetry.core.bodies import Body
 from robcal.photogrammetry.measure.measured_points import MeasuredPoints
 from robcal.photogrammetry.station.network import StationOrientation
+from robcal.physics.cause import ObservationCause
 from robcal.physics.prior_scale import DEVIATION
 from robcal.transforms import Array
 
 NAME = "diagnose"
-UNCORRECTED = frozenset({"refraction", "ellipse_eccentricity", "centroid_bias"})
 BEYOND_DOUBT = 1e-6
 
 
@@ -79,9 +79,9 @@ def work(context: Context) -> Outcome:
     if campaign.robot is None or campaign.poses is None:
         content = with_images(None, images.findings, images.scans, images.noise)
         write_json(run.diagnosis, content)
-        told = [str(finding.statement) for finding in images.findings] or [str(content["statement"])]
+        reported = [str(finding.statement) for finding in images.findings] or [str(content["statement"])]
         result = {"mismatch": content["mismatch"], "p_value": content["p_value"], "causes": _named(images.findings)}
-        return Outcome({"diagnosis": result | {"heldout_px": content["heldout_px"]}}, [run.diagnosis], told)
+        return Outcome({"diagnosis": result | {"heldout_px": content["heldout_px"]}}, [run.diagnosis], reported)
     _, poses = require_robot(campaign)
     identification = load_identification(run)
     points: MeasuredPoints | None = run.load("points") if run.has("points") else None
@@ -96,7 +96,7 @@ def work(context: Context) -> Outcome:
         return Outcome(notes=["nothing to diagnose"])
     free, tied = found.names, (*found.eliminated, *own_elasticities(found))
     if recording.own_station:
-        # told apart from the errors of the station, the frames show elasticities that were lost in them
+        # reported apart from the errors of the station, the frames show elasticities that were lost in them
         free, tied = (*found.names, *own_elasticities(found)), tuple(found.eliminated)
     diagnosis = diagnose(
         found.model,
@@ -109,7 +109,7 @@ def work(context: Context) -> Outcome:
         optional_parameters(found),
     )
     outputs = [run.diagnosis]
-    content = with_images(as_contract(diagnosis), images.findings, images.scans, images.noise)
+    content = with_images(diagnosis_content(diagnosis), images.findings, images.scans, images.noise)
     if recording.own_station and orientation is not None:
         content = with_station_moves(content, orientation.names, recording, diagnosis.model)
     write_json(run.diagnosis, content)
@@ -141,8 +141,8 @@ def work(context: Context) -> Outcome:
     if without is not None:
         outputs.append(run.save("corrected", without))
     outputs.append(run.save("evidence", evidence_of(found.model, recording, free, verify, diagnosis)))
-    told = [f.statement for f in images.findings] + [f.statement for f in diagnosis.findings]
-    notes = told or ["nothing missing: the model explains the data"]
+    reported = [f.statement for f in images.findings] + [f.statement for f in diagnosis.findings]
+    notes = reported or ["nothing missing: the model explains the data"]
     outcome = _result(diagnosis) | {"mismatch": content["mismatch"]}
     outcome["causes"] = [*_named(images.findings), *_result(diagnosis)["causes"]]
     return Outcome({"diagnosis": outcome}, outputs, notes)
@@ -178,9 +178,9 @@ def optional_parameters(found: IdentifiedRobot) -> tuple[str, ...]:
 def settings_beside(settings: SelectionSettings, findings: Sequence[ImageFinding]) -> SelectionSettings:
     """Settings beside causes in images that displace what is measured and are not taken back.
 
-    What they leave in the frames looks like small causes of the robot; only what is far beyond doubt is told.
+    What they leave in the frames looks like small causes of the robot; only what is far beyond doubt is reported.
     """
-    if any(finding.cause in UNCORRECTED for finding in findings):
+    if any(finding.kind.displaces_marks for finding in findings):
         return dataclasses.replace(settings, level=min(settings.level, BEYOND_DOUBT))
     return settings
 
@@ -207,9 +207,9 @@ def _relative_covariance(diagnosis: Diagnosis, recording: Recording) -> Array:
 def _final(diagnosis: Diagnosis, recording: Recording, iterations: int = 8) -> Fit:
     """The extended model at the recording: its terms are in the model, observation causes beside it."""
     direct = [
-        Accepted(f.family, f.constants, f.values, f.covariance)
+        Accepted(f.cause, f.constants, f.values, f.covariance)
         for f in diagnosis.findings
-        if f.family.displace is not None
+        if isinstance(f.cause, ObservationCause)
     ]
     clean = recording.subset(~np.isin(np.array(recording.names), diagnosis.blunders))
     return fit(diagnosis.model, clean, diagnosis.free, direct, iterations=iterations)
@@ -223,13 +223,13 @@ def _columns(rows: Any) -> dict[str, list[object]]:
 
 
 def _named(findings: Sequence[ImageFinding]) -> list[dict[str, Any]]:
-    return [{"cause": f.cause, "where": f.where, "direction": f.direction} for f in findings]
+    return [{"cause": f.name, "where": f.where, "direction": f.direction} for f in findings]
 
 
 def _result(diagnosis: Diagnosis) -> dict[str, Any]:
     before, after, floor = (v * 1000 for v in diagnosis.heldout)
     causes: Sequence[dict[str, Any]] = [
-        {"cause": f.family.cause, "where": f.family.where, "direction": f.family.direction} for f in diagnosis.findings
+        {"cause": f.cause.name, "where": f.cause.where, "direction": f.cause.direction} for f in diagnosis.findings
     ]
     return {
         "mismatch": diagnosis.mismatch,

@@ -22,7 +22,6 @@ from pipeline.stages.base import Context, Outcome, Stage
 from pipeline.stages.detect import DetectionIndex, load_detections
 from pipeline.stages.survey import located, size_of_marks
 from robcal.diagnosis.images.camera_moves import which_moved, with_small_moves
-from robcal.diagnosis.images.data import ImageData
 from robcal.diagnosis.images.diagnosis import ImageFinding
 from robcal.diagnosis.images.dot_sizes import with_dot_sizes
 from robcal.diagnosis.images.light_lag import without_lag
@@ -37,6 +36,7 @@ from robcal.photogrammetry.station.identify import identify_station
 from robcal.photogrammetry.station.network import StationMarks, StationOrientation, StationSettings
 from robcal.photogrammetry.station.orientation import orient_station
 from robcal.photogrammetry.station.seen_normals import ellipses_of, needs_normals, with_seen_normals
+from robcal.physics.images.data import ImageData
 
 NAME = "orient"
 
@@ -222,7 +222,7 @@ def _result(orientation: StationOrientation, marks: Mapping[str, StationMarks]) 
         "rms_px": orientation.rms_px,
         "redundancy": orientation.redundancy_total,
         "rejected": len(orientation.rejected),
-        "evidence": [e.kind for e in orientation.evidence],
+        "evidence": [e.name for e in orientation.evidence],
         "converged": orientation.converged,
     }
 
