@@ -1,7 +1,7 @@
 """Which parameters to identify: order of preference, what is plausible, choice of elasticities by evidence, indices.
 
 Geometry: all deviations are candidates; those that others can replace, or that the data determine worse than anybody
-would doubt them anyway, are eliminated and named (:func:`robcal.least_squares.split_dependent`).
+would doubt them anyway, are eliminated and named (:func:`robcal.estimation.dependence.split_dependent`).
 Elasticities are taken up only where the data ask for them, by F-tests on the identification poses: a needless one costs
 accuracy at other poses, a missing one too.
 """

@@ -15,7 +15,7 @@ from scipy import special
 
 from robcal.calibration.observations import Stack
 from robcal.calibration.solution import Engine, Solution
-from robcal.least_squares import cofactor
+from robcal.estimation.covariance import cofactor
 
 Array = NDArray[np.float64]
 

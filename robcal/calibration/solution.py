@@ -16,7 +16,9 @@ from scipy import linalg, special
 from robcal.calibration.identifiability import Candidates, check_poses, choose_by_evidence, limit_rules, limits_at
 from robcal.calibration.problem import Evaluator, Problem, State, whitening
 from robcal.errors import NotIdentifiable
-from robcal.least_squares import Eliminated, SolveSummary, TerminationSettings, gauss_newton, split_dependent
+from robcal.estimation.dependence import Eliminated, split_dependent
+from robcal.estimation.gauss_newton import gauss_newton
+from robcal.estimation.summary import SolveSummary, TerminationSettings
 
 Array = NDArray[np.float64]
 

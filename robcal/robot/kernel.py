@@ -6,6 +6,7 @@ fed with numpy arrays without copying.
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -21,6 +22,8 @@ from robcal.robot.statics import moment_names
 from robcal.robot.terms import identifier
 
 Array = NDArray[np.float64]
+# functions mapped over so many different numbers of poses are kept (folds, subsets and single poses of one campaign)
+MOST_MAPS = 32
 
 
 @dataclass(frozen=True)
@@ -72,7 +75,7 @@ class Kernel:
     Parameters
     ----------
     model : the robot; its parameters become ``theta0``.
-    statics : 'one_step' (moments of the chain before it gives way) or 'converged'.
+    statics : 'one_step' (moments of the chain before it deflects) or 'converged'.
 
     Attributes
     ----------
@@ -95,7 +98,7 @@ class Kernel:
         self.flange_T_tool = np.eye(4) if model.flange_T_tool is None else np.array(model.flange_T_tool)
         self._graph: PoseGraph | None = None
         self._functions: dict[str, ca.Function] = {}
-        self._mapped: dict[tuple[str, int], Any] = {}
+        self._maps: OrderedDict[tuple[str, int], tuple[Any, Any, Any]] = OrderedDict()
         self.covariates = self.graph().covariates
 
     def with_references(self, world_T_base: ArrayLike | None = None, flange_T_tool: ArrayLike | None = None) -> Kernel:
@@ -282,11 +285,7 @@ class Kernel:
         function = self.function(kind)
         if n == 0:
             return [np.zeros((0, function.numel_out(k))) for k in range(function.n_out())]
-        key = (kind, n)
-        if key not in self._mapped:
-            mapped = function.map(f"robot_{kind}_{n}", "serial", n, [0, 4, 5], [])
-            self._mapped[key] = (mapped, *mapped.buffer())
-        _, buffer, run = self._mapped[key]
+        buffer, run = self._mapped(kind, n)
         arguments = [
             np.ascontiguousarray(theta, dtype=float),
             np.ascontiguousarray(poses.q),
@@ -305,6 +304,18 @@ class Kernel:
             buffer.set_res(k, memoryview(array))  # type: ignore[arg-type]
         run()
         return results
+
+    def _mapped(self, kind: str, n: int) -> tuple[Any, Any]:
+        """Buffer and call of a function over n poses; the ones not used lately are dropped."""
+        key = (kind, n)
+        if key in self._maps:
+            self._maps.move_to_end(key)
+        else:
+            mapped = self.function(kind).map(f"robot_{kind}_{n}", "serial", n, [0, 4, 5], [])
+            self._maps[key] = (mapped, *mapped.buffer())
+            while len(self._maps) > MOST_MAPS:
+                self._maps.popitem(last=False)
+        return self._maps[key][1:]
 
     def __getstate__(self) -> dict[str, Any]:
         return {"model": self.model, "statics": self.statics, "references": (self.world_T_base, self.flange_T_tool)}

@@ -10,7 +10,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from pipeline.stages.diagnose import own_elasticities
 from robcal.calibration.observations import PointObservations
 from robcal.diagnosis.content import diagnosis_content
 from robcal.diagnosis.core.fitting import Accepted
@@ -19,6 +18,7 @@ from robcal.diagnosis.diagnose import diagnose
 from robcal.diagnosis.findings import rescaled
 from robcal.physics.cause import LinearCause
 from robcal.physics.joint import COUNTERBALANCE
+from robcal.recipe.robot_diagnosis import own_elasticities
 from robcal.transforms import exp_so3
 from tests.diagnosis.recordings import concealed
 
@@ -50,8 +50,8 @@ def test_single_cause_is_named_where_it_is(tmp_path: Path, seed: int, cause: str
 
 def test_amplitude_within_its_sigma(tmp_path: Path) -> None:
     diagnosis, truth = run(tmp_path, 114, "scale_error")
-    reported, sigma = diagnosis.findings[0].parameters["ppm"], diagnosis.findings[0].sigma["ppm"]
-    assert abs(reported - truth.plan.effects[0].parameters["ppm"]) < 4 * sigma
+    told, sigma = diagnosis.findings[0].parameters["ppm"], diagnosis.findings[0].sigma["ppm"]
+    assert abs(told - truth.plan.effects[0].parameters["ppm"]) < 4 * sigma
 
 
 def test_exchanged_targets_are_read_right(tmp_path: Path) -> None:
@@ -60,12 +60,9 @@ def test_exchanged_targets_are_read_right(tmp_path: Path) -> None:
     _, identify, verify, truth = concealed(tmp_path / "exchanged", seed=114, effects=["target_swapped"])
     diagnosis = diagnose(found.model, identify, found.names, (*found.eliminated, *own_elasticities(found)), verify)
     effect = truth.plan.effects[0]
-    reported = diagnosis.findings[0]
-    assert reported.cause.name == "target_swapped"
-    assert {int(reported.cause.where), reported.parameters["with"]} == {
-        int(effect.where),
-        int(effect.parameters["with"]),
-    }
+    told = diagnosis.findings[0]
+    assert told.cause.name == "target_swapped"
+    assert {int(told.cause.where), told.parameters["with"]} == {int(effect.where), int(effect.parameters["with"])}
     assert diagnosis.heldout[1] < 0.01 * diagnosis.heldout[0]
 
 

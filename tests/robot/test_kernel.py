@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from robcal import transforms as tf
 from robcal.errors import InvalidInput
-from robcal.robot.kernel import Kernel
+from robcal.robot.kernel import MOST_MAPS, Kernel
 from robcal.robot.model import Frame, Payload, RobotModel, Term
 from tests.robot.chains import TERMS, kr_like, random_chain, random_theta
 
@@ -206,3 +206,12 @@ def test_bad_input_is_named() -> None:
     with pytest.raises(InvalidInput, match="statics"):
         Kernel(kr_like(), "sometimes")
     assert Payload(1.0).cog == (0.0, 0.0, 0.0)
+
+
+def test_evaluations_over_many_numbers_of_poses_keep_memory_bounded() -> None:
+    kernel = Kernel(kr_like())
+    q = np.random.default_rng(5).uniform(-1, 1, (MOST_MAPS + 8, kernel.model.n_joints))
+    whole = kernel.frames(kernel.theta0, kernel.poses(q))
+    for n in range(1, len(q) + 1):
+        assert np.array_equal(kernel.frames(kernel.theta0, kernel.poses(q[:n])), whole[:n])
+    assert len(kernel._maps) == MOST_MAPS

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from robcal.errors import DegenerateGeometry, InvalidInput, NotIdentifiable
-from robcal.least_squares import SolveSummary
-from robcal.photogrammetry.bundle.datum import DatumWish, InnerOver, resolve_datum
+from robcal.estimation.summary import SolveSummary
+from robcal.photogrammetry.bundle.datum import DatumSpec, InnerOver, resolve_datum
 from robcal.photogrammetry.bundle.determinacy import intrinsics_basis, singular_unknowns, undetermined
 from robcal.photogrammetry.bundle.lengths import bars_scale, rows_of
 from robcal.photogrammetry.bundle.normals import Factor, MarkOrder, State, build_normals, linearise
@@ -83,7 +83,7 @@ class _Work:
         """Images and targets in use."""
         return np.unique(self.marks.image[self.kept]), np.unique(self.marks.target[self.kept])
 
-    def build(self, basis: Array, ids: IntArray, wish: DatumWish, lengths: Lengths) -> tuple:
+    def build(self, basis: Array, ids: IntArray, spec: DatumSpec, lengths: Lengths) -> tuple:
         """(problem, state, images, targets, note) of what is in use."""
         images, targets = self.subset()
         marks = self.marks.select(self.kept)
@@ -92,7 +92,7 @@ class _Work:
         )
         order = MarkOrder(compact, len(images), len(targets))
         state = State(self.state.camera, self.state.camera_T_body[images], self.state.points[targets])
-        datum, note = resolve_datum(wish, ids[targets], state.points, lengths)
+        datum, note = resolve_datum(spec, ids[targets], state.points, lengths)
         rows = rows_of(lengths, ids[targets])
         group = np.zeros(len(marks), np.int64) if order.marks.group is None else order.marks.group
         problem = Problem(
@@ -151,7 +151,7 @@ def adjust(
     image_names: Sequence[str] | None = None,
     lengths: Lengths | None = None,
     check_lengths: Lengths | None = None,
-    datum: DatumWish = "free",
+    datum: DatumSpec = "free",
     diameters: ArrayLike | None = None,
     normals: Array | None = None,
     free_intrinsics: Sequence[str] = INTRINSIC_NAMES,
@@ -194,7 +194,7 @@ def adjust(
     _drop_duplicates(work)
     left_out: list[tuple[str, str]] = []
     free = list(free_intrinsics)
-    shape_datum: DatumWish = datum if isinstance(datum, (tuple, InnerOver)) else "free"
+    shape_datum: DatumSpec = datum if isinstance(datum, (tuple, InnerOver)) else "free"
     while True:
         basis = intrinsics_basis(free)
         bad = _clean(work, basis, free, target_ids, shape_datum, settings)
@@ -281,7 +281,7 @@ def _drop_duplicates(work: _Work) -> None:
 
 
 def _clean(
-    work: _Work, basis: Array, free: Sequence[str], ids: IntArray, datum: DatumWish, settings: AdjustSettings
+    work: _Work, basis: Array, free: Sequence[str], ids: IntArray, datum: DatumSpec, settings: AdjustSettings
 ) -> tuple[str, ...]:
     """Adjust without scale bars, first robustly, and take out gross errors until none is left.
 
@@ -451,7 +451,7 @@ def _bring_to_scale(
     work: _Work,
     basis: Array,
     ids: IntArray,
-    datum: DatumWish,
+    datum: DatumSpec,
     lengths: Lengths,
     settings: AdjustSettings,
     notes: list[str],

@@ -18,7 +18,7 @@ import numpy as np
 import pycolmap
 
 from robcal.errors import InvalidInput
-from robcal.least_squares import SolveSummary
+from robcal.estimation.summary import SolveSummary
 from robcal.photogrammetry.bundle.body_frame import fit_similarity
 from robcal.photogrammetry.bundle.datum import Datum
 from robcal.photogrammetry.bundle.determinacy import intrinsics_basis

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from scipy import linalg
 
-from robcal.least_squares import SolveSummary
+from robcal.estimation.summary import SolveSummary
 from robcal.photogrammetry.bundle.determinacy import strong_correlations
 from robcal.photogrammetry.bundle.lengths import distances, length_results
 from robcal.photogrammetry.bundle.normals import Factor, State, build_normals, linearise
@@ -126,7 +126,7 @@ def finish(
         correlations=strong_correlations(free, image_names, Q[:k, :k], Q_mixed[:k], Q_station),
         scale_bars=length_results(lengths, ids, state.points, Q[k:, k:], "scale_bar", bars_sigma0),
         check_lengths=length_results(check_lengths, ids, state.points, Q[k:, k:], "check"),
-        datum=problem.datum.words,
+        datum=problem.datum.description,
         condition=_condition(factor),
         unknowns=6 * problem.order.images + len(factor.free),
         rank=6 * problem.order.images + numerical_rank(factor.equilibrated),

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from robcal.least_squares import SolveSummary
+from robcal.estimation.summary import SolveSummary
 from robcal.photogrammetry.bundle.datum import Datum
 from robcal.photogrammetry.bundle.normals import (
     Factor,

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from robcal.errors import InvalidInput
-from robcal.least_squares import SolveSummary
+from robcal.estimation.summary import SolveSummary
 from robcal.photogrammetry.core.camera import Camera
 from robcal.transforms import Array
 

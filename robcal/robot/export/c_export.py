@@ -4,6 +4,10 @@ The forward model is the kernel's graph with all identified numbers inserted (el
 the payload enters at run time by mass and centre of gravity. The inverse is the nominal robot's, in closed form where
 its joint lines allow one (:mod:`robcal.robot.structure`), Levenberg-Marquardt otherwise. Nothing is allocated; only
 ``math.h`` and ``string.h`` are included.
+
+The algorithms are the C files in ``c/``, which include each other as usual; which arm, which inverse is chosen by the
+macros ARM, CLOSED_FORM and INVERSE. Exported is one file: the robot's numbers (``robot_data.h.j2``), then the C files
+that this robot needs in the order of their includes.
 """
 
 from __future__ import annotations
@@ -11,17 +15,17 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cache
+from importlib.resources import files
+from typing import Any
 
 import casadi as ca
+import jinja2
 import numpy as np
 
 from robcal.errors import InvalidInput
 from robcal.robot.chain import Chain, chain_of
 from robcal.robot.compensation import FLIP, LARGEST_STEP, cell_frames
-from robcal.robot.export import c_inverse_templates as ci
-from robcal.robot.export import c_numeric_templates as cn
-from robcal.robot.export import c_templates as c
-from robcal.robot.export.c_command_templates import COMMANDS
 from robcal.robot.export.c_expressions import array, function_body, number
 from robcal.robot.inverse import carried_arm
 from robcal.robot.inverse_analytic import perpendicular
@@ -29,21 +33,34 @@ from robcal.robot.inverse_numeric import NumericSettings, start_configurations
 from robcal.robot.kernel import Kernel
 from robcal.robot.kernel_graph import pose_graph
 from robcal.robot.model import Payload, RobotModel
-from robcal.robot.structure import SphericalWrist, Structure, find_structure
-from robcal.transforms import Array, invert
+from robcal.robot.structure import SphericalWrist, find_structure
+from robcal.transforms import invert
 
+SOURCES = files("robcal.robot.export") / "c"
 _LOAD = "load"
+_STARTS = 24
+_UNLIMITED = 1e30
 
 
 @dataclass(frozen=True)
 class CSource:
-    """Exported source: names and texts of the two files, and the covariates in the order the functions expect."""
+    """Exported source.
+
+    Attributes
+    ----------
+    header_name, header, source_name, source : names and texts of the two files.
+    covariates : in the order in which the functions expect them.
+    data : the part of the source that is this robot's own (``robot_data.h``).
+    choices : the files that the macros ARM, CLOSED_FORM and INVERSE of the C sources stand for.
+    """
 
     header_name: str
     header: str
     source_name: str
     source: str
     covariates: tuple[str, ...]
+    data: str
+    choices: Mapping[str, str]
 
 
 def export_c(
@@ -63,45 +80,68 @@ def export_c(
     InvalidInput : a prefix that is no C name, or a term that has no counterpart in C.
     """
     name = prefix if prefix is not None else re.sub(r"\W+", "_", model.name.lower()).strip("_")
-    if not re.fullmatch(r"[A-Za-z]\w*", name):
+    if not re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII):
         raise InvalidInput(f"'{name}' cannot begin the names of C functions: give a prefix of letters and digits")
     kernel = Kernel(model, statics)
-    body, covariates = _real_robot(model, statics)
-    world_T_base, flange_T_tool = cell_frames(kernel)
-    nominal = chain_of(model)
-    chain = replace(nominal, home=nominal.home @ flange_T_tool)
+    body, covariates = _real_robot(kernel)
     # a '*/' in a name must not end the comment
-    title = re.sub(r"[^\w .,()+-]", "_", model.name)
-    values = {
-        "@P@": name,
-        "@N@": str(chain.n_joints),
-        "@TITLE@": title,
-        "@COVARIATES@": str(len(covariates)),
-        "@COVARIATE_SIZE@": str(max(1, len(covariates))),
-        "@COVARIATE_NOTE@": f" /* {', '.join(covariates)} */" if covariates else "",
-        "@PAYLOADS@": _payloads(kernel, name) + _defaults(covariates, defaults or {}, name),
-    }
-    parts = [
-        f'/* {title} */\n#include <math.h>\n#include <string.h>\n\n#include "{name}.h"\n\n#define N {chain.n_joints}',
-        _tables(chain, world_T_base),
-        *_inverse_parts(chain),
-        "\nstatic void real_robot(const double *q, const double *load, const double *covariate, double *T)\n{\n"
-        + body
-        + "\n}\n",
-        COMMANDS,
-    ]
-    source = "\n".join(parts)
-    for key, text in values.items():
-        source = source.replace(key, text)
-    header = c.HEADER
-    for key in ("@PAYLOADS@", "@COVARIATE_NOTE@", "@COVARIATE_SIZE@", "@COVARIATES@", "@TITLE@", "@N@", "@P@"):
-        header = header.replace(key, values[key])
-    return CSource(f"{name}.h", header, f"{name}.c", source, covariates)
+    common = {"prefix": name, "title": re.sub(r"[^\w .,()+-]", "_", model.name)}
+    inverse, choices = _inverse(kernel)
+    header = (
+        _environment()
+        .get_template("robot.h.j2")
+        .render(
+            common,
+            joints=model.n_joints,
+            covariates=covariates,
+            payloads=_payloads(kernel),
+            defaults=[(defaults or {}).get(covariate, 0.0) for covariate in covariates] or [0.0],
+        )
+    )
+    data = _environment().get_template("robot_data.h.j2").render(common, **inverse, real_robot=body)
+    source = f"/* {common['title']} */\n{data}{_amalgamated('commands.c', choices, {'robot_data.h'})}"
+    return CSource(f"{name}.h", header, f"{name}.c", source, covariates, data, choices)
 
 
-def _real_robot(model: RobotModel, statics: str) -> tuple[str, tuple[str, ...]]:
+@cache
+def _environment() -> jinja2.Environment:
+    """Templates with << >> and <% %>: double braces are C's own."""
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("robcal.robot.export", "c"),
+        undefined=jinja2.StrictUndefined,
+        variable_start_string="<<",
+        variable_end_string=">>",
+        block_start_string="<%",
+        block_end_string="%>",
+        comment_start_string="<#",
+        comment_end_string="#>",
+        trim_blocks=True,
+        keep_trailing_newline=True,
+        autoescape=False,
+    )
+    environment.filters["number"] = number
+    environment.filters["array"] = array
+    environment.filters["rows"] = lambda values: "{\n    " + ",\n    ".join(array(v) for v in values) + "}"
+    environment.filters["frame"] = lambda T: array(T[:3])
+    return environment
+
+
+def _amalgamated(name: str, choices: Mapping[str, str], done: set[str]) -> str:
+    """Text of a C file behind the texts of all that it includes, each once."""
+    done.add(name)
+    own, before = [], []
+    for line in (SOURCES / name).read_text(encoding="utf-8").splitlines():
+        include = re.fullmatch(r'#include (?:"(\S+)"|([A-Z_]+))', line)
+        if include is None:
+            own += [line] if line != "#pragma once" else []
+        elif (needed := include[1] or choices[include[2]]) not in done:
+            before.append(_amalgamated(needed, choices, done))
+    return "".join(before) + "\n" + "\n".join(own) + "\n"
+
+
+def _real_robot(kernel: Kernel) -> tuple[str, tuple[str, ...]]:
     """Body of world_T_tool(q, load, covariates), entries row by row, and the covariates' names."""
-    kernel = Kernel(model, statics)
+    model, statics = kernel.model, kernel.statics
     numbers = dict(zip(kernel.names, kernel.theta0, strict=True))
     # the payload of the call: a load of zero nominal mass whose deviations are the arguments
     loaded = replace(
@@ -124,83 +164,49 @@ def _real_robot(model: RobotModel, statics: str) -> tuple[str, tuple[str, ...]]:
     return function_body(function, ("q", "load", "covariate"), ("T",)), graph.covariates
 
 
-def _payloads(kernel: Kernel, prefix: str) -> str:
-    lines = []
+def _payloads(kernel: Kernel) -> list[dict[str, Any]]:
+    """C name, mass (kg) and centre of gravity (m, flange) of each payload, deviations included."""
+    rows = []
     for name, payload in kernel.model.payloads.items():
         at = kernel.index[f"payload.{name}.mass"]
-        mass = payload.mass + kernel.theta0[at]
         cog = np.array(payload.cog) + kernel.theta0[at + 1 : at + 4]
-        word = re.sub(r"\W", "_", name)
-        lines.append(f"#define {prefix}_payload_{word} {{{number(mass)}, {array(cog)}}}")
-    head = "\n/* Payloads of the campaign: initialisers of the structure above. */\n"
-    return head + "\n".join(lines) + "\n" if lines else ""
+        word = re.sub(r"\W", "_", name, flags=re.ASCII)
+        rows.append({"name": word, "mass": payload.mass + kernel.theta0[at], "cog": cog})
+    return rows
 
 
-def _defaults(covariates: tuple[str, ...], values: Mapping[str, float], prefix: str) -> str:
-    """Initialiser of the conditions: no payload, covariates as at the first recorded pose."""
-    numbers = array(np.array([values.get(name, 0.0) for name in covariates] or [0.0]))
-    return (
-        "\n/* Conditions where nothing better is known: no payload, the rest as at the first recorded pose. */\n"
-        f"#define {prefix}_conditions_default {{{{0.0, {{0.0, 0.0, 0.0}}}}, {numbers}}}\n"
+def _inverse(kernel: Kernel) -> tuple[dict[str, Any], dict[str, str]]:
+    """What the templates need for chain and inverse, and the C files of this robot's inverse."""
+    world_T_base, flange_T_tool = cell_frames(kernel)
+    nominal = chain_of(kernel.model)
+    chain: Chain = replace(
+        nominal,
+        home=nominal.home @ flange_T_tool,
+        lower=np.maximum(nominal.lower, -_UNLIMITED),
+        upper=np.minimum(nominal.upper, _UNLIMITED),
     )
-
-
-def _tables(chain: Chain, world_T_base: Array) -> str:
-    def rows(name: str, values: Array) -> str:
-        return f"static const double {name}[N][3] = {{\n    " + ",\n    ".join(array(v) for v in values) + "};"
-
-    def frame(name: str, T: Array) -> str:
-        return f"static const double {name}[12] = {array(T[:3].ravel())};"
-
-    big = 1e30
-    flags = ", ".join("1" if p else "0" for p in chain.prismatic)
-    return "\n".join(
-        [
-            "/* joint lines at zero position, positive sense of q */",
-            rows("AXIS", chain.axes),
-            rows("POINT", chain.points),
-            f"static const int PRISMATIC[N] = {{{flags}}};",
-            f"static const double LOWER[N] = {array(np.maximum(chain.lower, -big))};",
-            f"static const double UPPER[N] = {array(np.minimum(chain.upper, big))};",
-            frame("HOME", chain.home),
-            frame("WORLD_T_BASE", world_T_base),
-            frame("BASE_T_WORLD", invert(world_T_base)),
-        ]
-    )
-
-
-def _inverse_parts(chain: Chain) -> list[str]:
     settings = NumericSettings()
-    length = settings.weight(chain)[3]
-    parts = [c.VECTORS, c.CHAIN, f"\n#define ROTATION_LENGTH {number(length)}"]
-    parts.append(f"#define LARGEST_STEP {number(LARGEST_STEP)}\n#define FLIP {number(FLIP)}")
-    if chain.n_joints < 6:
-        parts.append(f"#define TILT_TOLERANCE {number(settings.tilt_tolerance)}")
-    parts.append(cn.NUMERIC)
+    values: dict[str, Any] = {
+        "chain": chain,
+        "world_T_base": world_T_base,
+        "base_T_world": invert(world_T_base),
+        "rotation_length": settings.weight(chain)[3],
+        "largest_step": LARGEST_STEP,
+        "flip": FLIP,
+        "tilt_tolerance": settings.tilt_tolerance,
+    }
     arm, first = carried_arm(chain)
-    structure: Structure = find_structure(arm) if arm is not None else None
+    structure = find_structure(arm) if arm is not None else None
     if arm is None or structure is None:
-        starts = start_configurations(chain, 24)
-        table = ",\n    ".join(array(s) for s in starts)
-        start_table = f"static const double START[STARTS][N] = {{\n    {table}}};"
-        parts += ["#define HELD 0", f"#define STARTS {len(starts)}", start_table]
-        return [*parts, cn.NUMERIC_INVERSE]
-    probe = perpendicular(arm.axes[5] if isinstance(structure, SphericalWrist) else arm.axes[1])
-    parts += [
-        f"#define FIRST {first}",
-        "#define HELD FIRST",
-        f"static const double HOME_INVERSE[12] = {array(invert(chain.home)[:3].ravel())};",
-        f"static const double CENTRE[3] = {array(structure.centre)};",
-        f"static const double PROBE[3] = {array(probe)};",
-        ci.SUBPROBLEMS,
-    ]
-    if isinstance(structure, SphericalWrist):
-        if structure.shoulder is not None:
-            parts.append(f"static const double SHOULDER[3] = {array(structure.shoulder)};")
-        if structure.arm != "meeting_12":
-            parts.append(ci.TO_PLANE)
-        arms = {"parallel_23": ci.ARM_PARALLEL_23, "meeting_12": ci.ARM_MEETING_12, "parallel_12": ci.ARM_PARALLEL_12}
-        parts += [ci.TWO_TURNS, arms[structure.arm], ci.SPHERICAL_WRIST]
-    else:
-        parts += [ci.TO_PLANE, ci.PARALLEL_ARM]
-    return [*parts, ci.CLOSED_INVERSE]
+        starts = start_configurations(chain, _STARTS)
+        return {**values, "structure": None, "starts": starts}, {"INVERSE": "numeric_inverse.h"}
+    wrist = structure if isinstance(structure, SphericalWrist) else None
+    closed = {"CLOSED_FORM": "spherical_wrist.h", "ARM": f"arm_{wrist.arm}.h"} if wrist else None
+    values |= {
+        "structure": structure,
+        "first": first,
+        "home_inverse": invert(chain.home),
+        "probe": perpendicular(arm.axes[5] if wrist else arm.axes[1]),
+        "shoulder": wrist.shoulder if wrist else None,
+    }
+    return values, {"INVERSE": "closed_inverse.h", **(closed or {"CLOSED_FORM": "parallel_arm.h"})}

@@ -14,7 +14,7 @@ import pytest
 from robcal.errors import InvalidInput
 from robcal.robot.chain import chain_of, forward
 from robcal.robot.compensation import cell_frames, compensate
-from robcal.robot.export.c_export import export_c
+from robcal.robot.export.c_export import SOURCES, export_c
 from robcal.robot.export.c_expressions import function_body, number
 from robcal.robot.inverse import inverse_kinematics, select
 from robcal.robot.kernel import Kernel
@@ -26,6 +26,8 @@ from tests.robot.test_inverse import random_wrist_arm
 
 pytestmark = pytest.mark.skipif(shutil.which("gcc") is None, reason="needs gcc")
 POINTER = ctypes.POINTER(ctypes.c_double)
+STRICT = ["-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror"]
+ARMS = ["parallel_23", "meeting_12", "parallel_12", "parallel_arm"]
 
 
 class Compiled:
@@ -35,8 +37,7 @@ class Compiled:
         code = export_c(model, "bot", statics)
         (folder / code.header_name).write_text(code.header)
         (folder / code.source_name).write_text(code.source)
-        flags = ["-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-O1", "-shared", "-fPIC"]
-        command = ["gcc", *flags, "-o", "bot.so", code.source_name, "-lm"]
+        command = ["gcc", *STRICT, "-O1", "-shared", "-fPIC", "-o", "bot.so", code.source_name, "-lm"]
         done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stderr[:2000]
         self.library = ctypes.CDLL(str(folder / "bot.so"))
@@ -96,7 +97,7 @@ def test_commands_agree_with_python(name, tmp_path):
         assert commanded == pytest.approx(expected.q, abs=3e-8)
 
 
-@pytest.mark.parametrize("kind", ["parallel_23", "meeting_12", "parallel_12", "parallel_arm"])
+@pytest.mark.parametrize("kind", ARMS)
 def test_closed_form_inverse_of_arbitrary_arms(kind, tmp_path):
     rng = np.random.default_rng(12)
     model = random_wrist_arm(rng, kind)
@@ -163,3 +164,36 @@ def test_numbers_that_are_not_finite_are_refused():
     x = ca.SX.sym("x")
     with pytest.raises(InvalidInput, match="not finite"):
         function_body(ca.Function("f", [x], [x * float("inf")]), ("x",), ("y",))
+
+
+@pytest.mark.parametrize("kind", [*ARMS, "scara"])
+def test_c_sources_compile_and_pass_the_linter_as_they_lie_in_the_package(kind, tmp_path):
+    """The files in ``c/`` through their own includes, without the export's amalgamation."""
+    robot = real_robot("scara_600", np.random.default_rng(1)) if kind == "scara" else _arm(kind)
+    code = export_c(robot, "bot")
+    (tmp_path / "bot.h").write_text(code.header)
+    (tmp_path / "robot_data.h").write_text(code.data)
+    places = [f"-I{tmp_path}", f"-I{SOURCES}"]
+    places += [f'-D{macro}="{name}"' for macro, name in code.choices.items()]
+    commands = [["gcc", *STRICT, "-fsyntax-only"]]
+    if shutil.which("cppcheck"):
+        quiet = ["--suppress=missingIncludeSystem", "--suppress=unusedFunction", "--inline-suppr"]
+        commands.append(["cppcheck", "-q", "--std=c99", "--enable=warning,portability", *quiet, "--error-exitcode=1"])
+    for command in commands:
+        done = subprocess.run(
+            [*command, *places, str(SOURCES / "commands.c")], capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stdout[:2000] + done.stderr[:2000]
+    assert 'include "' not in code.source.replace('#include "bot.h"', "")
+
+
+def test_every_c_source_is_reached_by_some_robot():
+    robots = [_arm(kind) for kind in ARMS] + [real_robot("scara_600", np.random.default_rng(1))]
+    exported = "".join(export_c(robot, "bot").source for robot in robots)
+    for path in SOURCES.iterdir():
+        if path.name.endswith((".c", ".h")):
+            assert path.read_text().splitlines()[0] in exported, path.name
+
+
+def _arm(kind: str) -> RobotModel:
+    return random_wrist_arm(np.random.default_rng(12), kind)

@@ -1,7 +1,7 @@
-"""The fixed part of exported C for forward model and corrected commands, as in :mod:`robcal.robot.compensation`."""
+/* Forward model of the real robot and corrected commands. */
+#include INVERSE
 
-COMMANDS = r"""
-void @P@_forward(const double q[N], const @P@_conditions *conditions, double world_T_tool[12])
+void ROBOT(forward)(const double q[N], const ROBOT(conditions) *conditions, double world_T_tool[12])
 {
     double load[4];
     load[0] = conditions->payload.mass;
@@ -11,17 +11,17 @@ void @P@_forward(const double q[N], const @P@_conditions *conditions, double wor
     real_robot(q, load, conditions->covariate, world_T_tool);
 }
 
-void @P@_nominal_forward(const double q[N], double base_T_tool[12])
+void ROBOT(nominal_forward)(const double q[N], double base_T_tool[12])
 {
     chain(q, base_T_tool, 0);
 }
 
-void @P@_base_from_world(const double world_T_x[12], double base_T_x[12])
+void ROBOT(base_from_world)(const double world_T_x[12], double base_T_x[12])
 {
     multiply(BASE_T_WORLD, world_T_x, base_T_x);
 }
 
-void @P@_world_from_base(const double base_T_x[12], double world_T_x[12])
+void ROBOT(world_from_base)(const double base_T_x[12], double world_T_x[12])
 {
     multiply(WORLD_T_BASE, base_T_x, world_T_x);
 }
@@ -105,14 +105,14 @@ static int correct(const double *F, const double *real, double *q)
     invert(Fh, inverse);
     multiply(inverse, F, gap);
     multiply(T, gap, target);
-    result = @P@_nominal_inverse(target, q, next);
-    for (i = 0; i < N && result == @P@_OK; ++i) {
+    result = ROBOT(nominal_inverse)(target, q, next);
+    for (i = 0; i < N && result == ROBOT(OK); ++i) {
         /* a correction must not change the configuration */
         if (fabs(next[i] - q[i]) > FLIP) {
-            result = @P@_OUT_OF_REACH;
+            result = ROBOT(OUT_OF_REACH);
         }
     }
-    if (result == @P@_OK) {
+    if (result == ROBOT(OK)) {
         memcpy(q, next, sizeof next);
     }
     return result;
@@ -123,19 +123,19 @@ static int correct(const double *F, const double *real, double *q)
     multiply(WORLD_T_BASE, F, target);
     difference(real, target, r);
     linearise(q, &at);
-    return step(&at, r, q) ? @P@_OK : @P@_BEYOND_LIMITS;
+    return step(&at, r, q) ? ROBOT(OK) : ROBOT(BEYOND_LIMITS);
 #endif
 }
 
-int @P@_first_order(const double world_T_tool[12], const @P@_conditions *conditions, const double near[N],
+int ROBOT(first_order)(const double world_T_tool[12], const ROBOT(conditions) *conditions, const double near[N],
                     double q[N], double *base_T_target)
 {
     double F[12], real[12];
     int result;
     multiply(BASE_T_WORLD, world_T_tool, F);
-    result = @P@_nominal_inverse(F, near, q);
-    if (result == @P@_OK) {
-        @P@_forward(q, conditions, real);
+    result = ROBOT(nominal_inverse)(F, near, q);
+    if (result == ROBOT(OK)) {
+        ROBOT(forward)(q, conditions, real);
         result = correct(F, real, q);
     }
     if (base_T_target) {
@@ -144,16 +144,16 @@ int @P@_first_order(const double world_T_tool[12], const @P@_conditions *conditi
     return result;
 }
 
-int @P@_exact(const double world_T_tool[12], const @P@_conditions *conditions, const double near[N],
+int ROBOT(exact)(const double world_T_tool[12], const ROBOT(conditions) *conditions, const double near[N],
               double q[N], double *base_T_target, double *remaining)
 {
     linear at;
     double F[12], real[12], r[6], back[6], size = HUGE_VAL, before;
     int result, round, k, quick = 1, fresh = 1;
     multiply(BASE_T_WORLD, world_T_tool, F);
-    result = @P@_nominal_inverse(F, near, q);
-    for (round = 0; result == @P@_OK; ++round) {
-        @P@_forward(q, conditions, real);
+    result = ROBOT(nominal_inverse)(F, near, q);
+    for (round = 0; result == ROBOT(OK); ++round) {
+        ROBOT(forward)(q, conditions, real);
         difference(world_T_tool, real, r);
         before = size;
         size = 0.0;
@@ -165,7 +165,7 @@ int @P@_exact(const double world_T_tool[12], const @P@_conditions *conditions, c
             break;
         }
         if (round == 25) {
-            result = @P@_NOT_CONVERGED;
+            result = ROBOT(NOT_CONVERGED);
             break;
         }
         /* joint steps while they gain much, by one linearisation as long as it serves well; near singularities the
@@ -188,4 +188,3 @@ int @P@_exact(const double world_T_tool[12], const @P@_conditions *conditions, c
     }
     return result;
 }
-"""

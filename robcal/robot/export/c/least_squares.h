@@ -1,9 +1,7 @@
-"""The fixed parts of exported C for least squares in joint space: Cholesky, Levenberg-Marquardt, numeric inverse.
+/* Least squares in joint space: Cholesky factor, Levenberg-Marquardt. */
+#pragma once
+#include "chain.h"
 
-Mathematics: :mod:`robcal.robot.inverse_numeric`; conventions: :mod:`robcal.robot.export.c_templates`.
-"""
-
-NUMERIC = r"""
 /* Cholesky factor of a symmetric matrix, of which the lower part is given, in place; 0 if not positive definite. */
 static int factorise(double A[N][N])
 {
@@ -104,30 +102,3 @@ static int refine(const double *target, double *q, int iterations)
     return dot(r, r) < 1e-14 && dot(r + 3, r + 3) < TILT_TOLERANCE * TILT_TOLERANCE;
 #endif
 }
-"""
-
-NUMERIC_INVERSE = r"""
-int @P@_nominal_inverse(const double base_T_tool[12], const double near[N], double q[N])
-{
-    double start[N], trial[N];
-    int k, result = @P@_OUT_OF_REACH;
-    memcpy(start, near, sizeof start);
-    for (k = -1; k < STARTS; ++k) {
-        memcpy(trial, k < 0 ? start : START[k], sizeof trial);
-        if (refine(base_T_tool, trial, 80)) {
-            int inside = turn_near(trial, start);
-            if (inside || result == @P@_OUT_OF_REACH) {
-                memcpy(q, trial, sizeof trial);
-                result = inside ? @P@_OK : @P@_BEYOND_LIMITS;
-            }
-            if (inside) {
-                return result;
-            }
-        }
-    }
-    if (result == @P@_OUT_OF_REACH) {
-        memcpy(q, start, sizeof start);
-    }
-    return result;
-}
-"""

@@ -1,0 +1,1 @@
+"""Least-squares estimation: iterations, robust weights, normal equations, covariance, reliability."""

@@ -1,0 +1,25 @@
+"""Elimination of dependent parameters on columns whose dependence is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from robcal.estimation.dependence import split_dependent
+
+
+def test_dependent_columns_are_named_with_their_ties() -> None:
+    rng = np.random.default_rng(0)
+    J = rng.normal(size=(40, 6))
+    J[:, 3] = 2.0 * J[:, 0] - 0.5 * J[:, 1]
+    J[:, 4] = 0.0
+    J[:, 5] *= 1e-3
+    kept, gone = split_dependent(J.T @ J, list("abcdef"), np.array([np.inf] * 5 + [10.0]))
+    assert kept == [0, 1, 2]
+    by_name = {e.name: e for e in gone}
+    assert by_name["d"].reason == "dependent"
+    assert by_name["d"].tied_to == pytest.approx({"a": 2.0, "b": -0.5}, abs=1e-6)
+    assert by_name["e"].reason == "no influence"
+    assert by_name["f"].reason == "weak"
+    assert by_name["f"].sigma == pytest.approx(1e3 / np.sqrt(40), rel=0.5)
+    assert split_dependent(J.T @ J, list("abcdef"))[0] == [0, 1, 2, 5]
