@@ -20,8 +20,8 @@ from pipeline.stages.identify import load_calibrated, load_identification
 from robcal.calibration.calibrated import CalibratedRobot
 from robcal.diagnosis.images.camera_moves import epochs_of
 from robcal.diagnosis.images.diagnosis import ImageFinding
-from robcal.physics.library import kinds
 from robcal.diagnosis.search.selection import SelectionSettings
+from robcal.physics.library import kinds
 from robcal.recipe.recording import common_errors
 from robcal.recipe.robot_diagnosis import settings_beside
 
