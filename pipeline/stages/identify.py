@@ -28,6 +28,10 @@ from robcal.transforms import Array
 NAME = "identify"
 
 
+SUFFIXES = {".csv", ".yaml", ".yml", ".urdf", ".xml"}
+"""Files of a campaign that this stage may depend on; all others are images."""
+
+
 @dataclass(frozen=True)
 class Identification:
     """What the stages after it need.
@@ -198,8 +202,10 @@ STAGE = Stage(
     name=NAME,
     applies=lambda campaign: campaign.robot is not None and campaign.poses is not None,
     work=work,
-    inputs=lambda campaign: [p for p in campaign.files if p.suffix.lower() in {".csv", ".yaml", ".yml"}],
-    settings=lambda campaign: campaign.entry.model_dump(include={"model", "payloads", "measurements", "body"}),
+    inputs=lambda campaign: [
+        p for p in campaign.files if p.suffix.lower() in {".csv", ".yaml", ".yml", ".urdf", ".xml"}
+    ],
+    settings=lambda campaign: campaign.entry.model_dump(include={"robot", "model", "payloads", "measurements", "body"}),
     after=("survey", "measure", "frames"),
     module=__name__,
 )
