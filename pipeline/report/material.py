@@ -9,7 +9,8 @@ from typing import Any
 
 from pipeline.campaign import Campaign, read_campaign
 from pipeline.codec import StaleCache
-from pipeline.runs import Run, campaign_of, read_json, run_file
+from pipeline.json_io import read_json
+from pipeline.runs import Run, campaign_of, run_file
 from pipeline.stages.registry import STAGES
 from robcal.calibration.verification import Verification
 from robcal.errors import RobcalError
@@ -124,7 +125,8 @@ class Material:
     @cached_property
     def calibrated(self) -> Any:
         """The calibrated robot with what the diagnosis added."""
-        return self.artifact("calibrated_diagnose", "diagnose") or self.artifact("calibrated_identify", "identify")
+        found = self.artifact("calibrated", "diagnose")
+        return found if found is not None or self.identification is None else self.identification.robot
 
     @cached_property
     def verification(self) -> tuple[Verification, Any] | None:
