@@ -38,7 +38,7 @@ class Recording:
     shared : repeatability of the joints as estimated.
     common : (m_obs, 3 | 6, k) displacements of points or frames by one
         standard deviation of errors common to all poses (orientation of the station, coordinates of the body).
-    own_station : measured by cameras whose own images are diagnosed: their moves are told from those.
+    own_station : measured by cameras whose own images are diagnosed: their moves are reported from those.
     """
 
     q: Array
@@ -97,11 +97,6 @@ class Recording:
         L = np.linalg.cholesky(self.observations.noise(np.tile(np.eye(4), (len(self.q), 1, 1))))
         columns = np.linalg.solve(L, self.common).reshape(-1, self.common.shape[2])
         return CommonNoise(columns if self.shared is None else self.shared.whiten(columns))
-
-    @cached_property
-    def laws(self) -> dict[tuple[str | float, ...], Array]:
-        """Values (n,) of expressions already evaluated that depend on the recording alone, not on the model."""
-        return {}
 
     @property
     def scatter(self) -> float:
@@ -166,7 +161,7 @@ def _rows(observations: SpatialObservations, keep: Array) -> SpatialObservations
 
 
 def observation_data(recording: Recording, frames: Array, variables: Mapping[str, Array]) -> ObservationData:
-    """What observation families need, at the modelled frames (n, 4, 4)."""
+    """What observation causes need, at the modelled frames (n, 4, 4)."""
     obs = recording.observations
     m = len(obs.pose)
     T = frames[obs.pose]

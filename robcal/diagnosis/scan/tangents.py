@@ -1,23 +1,44 @@
-"""Whitened tangent columns of families at a fit: what each cause would do to the residuals."""
+"""Whitened tangent columns of causes at a fit: what each cause would do to the residuals."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
 from robcal.diagnosis.core.fitting import Fit
 from robcal.diagnosis.core.recording import Recording, observation_data
 from robcal.diagnosis.scan.statistics import Entry
-from robcal.physics.cause import Array, Basis, Constants, Family, ObservationData
+from robcal.physics.cause import Array, Basis, Constants, LinearCause, ObservationCause, ObservationData
 from robcal.robot.terms import names_in
+
+
+class Laws:
+    """Values of expressions at the poses of one recording.
+
+    Those that depend on the recording alone, not on the model, are evaluated once for all fits that share the object.
+    """
+
+    def __init__(self, recording: Recording) -> None:
+        joints = (f"q{k + 1}" for k in range(recording.q.shape[1]))
+        self._recorded = frozenset([*recording.covariates, *joints])
+        self._known: dict[tuple[str | float, ...], Array] = {}
+
+    def value(self, basis: Basis, variables: Mapping[str, Array]) -> Array:
+        """Value (n,) of a law; `variables` are those of the present fit."""
+        key: tuple[str | float, ...] = (basis.template, *basis.constants.values())
+        if key in self._known:
+            return self._known[key]
+        value = np.broadcast_to(basis.value(variables), variables["index"].shape)
+        if names_in(basis.template).difference(basis.constants) <= self._recorded:
+            self._known[key] = value
+        return value
 
 
 @dataclass(frozen=True)
 class Tangents:
-    """Everything needed to write a family's columns at one fit.
+    """Everything needed to write a cause's columns at one fit.
 
     Attributes
     ----------
@@ -34,39 +55,24 @@ class Tangents:
     row_pose: Array
     frames: Array
     data: ObservationData
+    laws: Laws
 
-    def columns(self, family: Family, constants: Constants) -> Array:
-        """Whitened columns (m, c) of a family per unit amplitude."""
-        if family.frees:
-            return np.stack([self.parameters[name] for name in family.frees], axis=1)
-        if family.displace is not None:
-            return self.recording.whiten(family.displace(self.data, constants), self.frames)
-        names = family.names(constants)
+    def columns(self, cause: LinearCause, constants: Constants) -> Array:
+        """Whitened columns (m, c) of a cause per unit amplitude."""
+        if cause.free_parameters:
+            return np.stack([self.parameters[name] for name in cause.free_parameters], axis=1)
+        if isinstance(cause, ObservationCause):
+            return self.recording.whiten(cause.observation_shift(self.data, constants), self.frames)
+        names = cause.names(constants)
         out = np.zeros((len(self.row_pose), len(names)))
-        if family.bases is not None:
-            for basis in family.bases(constants):
-                law = self._law(basis)
-                out[:, names.index(basis.parameter)] += self.motion[basis.frame, basis.kind] * law[self.row_pose]
+        for basis in cause.laws(constants):
+            law = self.laws.value(basis, self.variables)
+            out[:, names.index(basis.parameter)] += self.motion[basis.frame, basis.kind] * law[self.row_pose]
         return self.recording.beside_common(out)
 
-    def _law(self, basis: Basis) -> Array:
-        """Value (n,) of an expression; what does not depend on moments is kept for later fits of the recording."""
-        key: tuple[str | float, ...] = (basis.template, *basis.constants.values())
-        known = self.recording.laws.get(key)
-        if known is None:
-            known = np.broadcast_to(basis.value(self.variables), self.variables["index"].shape)
-            names = names_in(basis.template).difference(basis.constants)
-            if all(name in self.recording.covariates or name in self._joints for name in names):
-                self.recording.laws[key] = known
-        return known
 
-    @cached_property
-    def _joints(self) -> frozenset[str]:
-        return frozenset(f"q{k + 1}" for k in range(self.recording.q.shape[1]))
-
-
-def tangents(fit: Fit, recording: Recording) -> Tangents:
-    """Tangents at a fit."""
+def tangents(fit: Fit, recording: Recording, laws: Laws | None = None) -> Tangents:
+    """Tangents at a fit; `laws` are shared by several fits of the same poses."""
     kernel = fit.kernel
     basis = kernel.scan_basis(fit.theta, fit.inputs)
     _, motion = replace(recording, common=None).linearise(fit.frames, basis.J)
@@ -82,15 +88,16 @@ def tangents(fit: Fit, recording: Recording) -> Tangents:
         fit.row_pose,
         fit.frames,
         observation_data(recording, fit.frames, variables),
+        Laws(recording) if laws is None else laws,
     )
 
 
-def entries(families: Sequence[Family], at: Tangents) -> list[Entry]:
-    """Columns of all families at all their grid points, scaled by the typical amplitudes."""
+def entries(causes: Sequence[LinearCause], at: Tangents) -> list[Entry]:
+    """Columns of all causes at all their grid points, scaled by the typical amplitudes."""
     out = []
-    for i, family in enumerate(families):
-        for g, constants in enumerate(family.grid):
-            columns = at.columns(family, constants) * family.sizes(constants)
+    for i, cause in enumerate(causes):
+        for g, constants in enumerate(cause.grid):
+            columns = at.columns(cause, constants) * cause.sizes(constants)
             if np.all(np.isfinite(columns)):
-                out.append(Entry(i, g, columns, family.positive))
+                out.append(Entry(i, g, columns, cause.positive))
     return out
