@@ -6,7 +6,6 @@ import numpy as np
 
 from pipeline.artifacts import FRAMES, POINTS
 from pipeline.campaign import Campaign
-from pipeline.measurement_tables import MeasuredTable
 from pipeline.runs import Run
 from robcal.calibration.measurements import (
     ASSUMED_SIGMA,
@@ -22,6 +21,7 @@ from robcal.calibration.observations import (
     SensorPointObservations,
 )
 from robcal.errors import InvalidInput
+from robcal.files.measurement_tables import MeasuredTable
 from robcal.photogrammetry.core.bodies import Body
 from robcal.transforms import Array
 
