@@ -23,7 +23,7 @@ def verify_robot(
     identification: Identification,
     robot: CalibratedRobot,
     log: JointLog,
-    options: IdentifyOptions,
+    options: IdentifyOptions | None = None,
     freed: RobotRecording | None = None,
     relative: Array | None = None,
 ) -> tuple[Verification, Rows, list[str]]:
@@ -39,7 +39,7 @@ def verify_robot(
     -------
     The verification, the rows (n,) of its poses in the joint log, and sentences on what was left out or assumed.
     """
-    rows = identification.rows
+    rows, options = identification.rows, options or IdentifyOptions()
     recording = identification.recording if freed is None else freed
     notes = [] if freed is None else ["verified without the errors of the measuring system that all poses share"]
     inputs = log.inputs(robot.kernel)
