@@ -17,14 +17,14 @@ from scipy import stats
 
 from benchmarks.robots import Truth, kr125_like, measured, random_poses, table, true_robot
 from robcal import transforms as tf
-from robcal.calibration.identification import IdentifiedRobot, IdentifyOptions, identify, predict_frames
+from robcal.calibration.identification import IdentifiedRobot, IdentifyOptions, identify
 from robcal.calibration.observations import Observations, PointObservations
 from robcal.robot.kernel import Kernel, PoseInputs
 
 
 def mean_error(robot: IdentifiedRobot, truth: Truth, poses: PoseInputs) -> float:
     """Mean distance of predicted and true tool origins, mm."""
-    T, _ = predict_frames(robot, poses)
+    T, _ = robot.predict(poses)
     return float(np.linalg.norm((T - truth.frames(poses))[:, :3, 3], axis=1).mean() * 1e3)
 
 
@@ -139,7 +139,7 @@ def coverage(runs: int) -> None:
     poses, kept_out = random_poses(kernel, rng, 80), random_poses(kernel, rng, 20)
     exact = identify(kernel.model, poses, [measured(truth, poses, rng)], IdentifyOptions(robust=False), kernel)
     names = exact.names
-    plain = Truth(exact.kernel, exact.full_theta)
+    plain = Truth(exact.kernel, exact.kernel.theta0)
     chosen = IdentifyOptions(parameters=names, robust=False, covariance="stated")
     base = [n for n in names if n.startswith(("base.", "tool."))]
     for run in range(runs):
@@ -162,7 +162,7 @@ def coverage(runs: int) -> None:
                 else ("length" if kind in "xyz" else "angle")
             )
             inside.setdefault(group, []).append(abs(miss[name]) < 1.959964 * sigma[name])
-        T, C = predict_frames(robot, kept_out)
+        T, C = robot.predict(kept_out)
         d = tf.difference(T, plain.frames(kept_out))[:, :3]
         z = np.einsum("ni,nij,nj->n", d, np.linalg.inv(C[:, :3, :3]), d)
         inside.setdefault("predicted position", []).extend((z < stats.chi2.isf(0.05, 3)).tolist())
@@ -208,7 +208,7 @@ def agreement(seeds: int) -> None:
             robots.append(identify(kernel.model, poses.subset(rows), observed, kernel=kernel))
         for out, robot in zip(errors.values(), robots, strict=True):
             out.append(mean_error(robot, truth, kept_out))
-        (T6, C6), (T3, C3) = (predict_frames(robot, kept_out) for robot in robots[:2])
+        (T6, C6), (T3, C3) = (robot.predict(kept_out) for robot in robots[:2])
         d = (T3 - T6)[:, :3, 3]
         R6, R3 = T6[:, :3, :3], T3[:, :3, :3]
         C = R6 @ C6[:, :3, :3] @ np.swapaxes(R6, 1, 2) + R3 @ C3[:, :3, :3] @ np.swapaxes(R3, 1, 2)

@@ -21,8 +21,8 @@ import numpy as np
 import yaml
 
 from robcal import transforms as tf
+from robcal.robot.export.urdf import urdf_text
 from robcal.robot.model import RobotModel
-from robcal.robot.urdf import urdf_text
 
 SIGMA, SIGMA_ANGLE = 5e-5, 1e-4
 COMPONENTS = ("x", "y", "z", "phix", "phiy", "phiz")

@@ -17,7 +17,7 @@ from scipy import optimize
 
 from benchmarks.peer_figaroh import predicted_positions
 from benchmarks.robots import kr125_like, measured, random_poses, table, true_robot
-from robcal.calibration.identification import identify, predict_frames
+from robcal.calibration.identification import identify
 from robcal.calibration.observations import FrameObservations
 from robcal.calibration.start_values import hand_eye
 from robcal.robot.kernel import Kernel, PoseInputs
@@ -103,7 +103,7 @@ def _programs(
         start = time.process_time()
         robot = identify(model, poses, [observed])
         seconds = time.process_time() - start
-        return predict_frames(robot, kept_out)[0][:, :3, 3], seconds
+        return robot.predict(kept_out)[0][:, :3, 3], seconds
 
     def figaroh(mended: bool) -> Callable[[], tuple[np.ndarray, float]]:
         return lambda: predicted_positions(model, "172 kg", poses.q, T, kept_out.q, compliant, mended)

@@ -92,10 +92,10 @@ def waves_by_evidence(robot: IdentifiedRobot, poses: PoseInputs, measured: Frame
     stack = Stack([measured.subset(inside)], len(inside))
     poses = poses.subset(inside)
     evaluator = Evaluator(robot.kernel, poses, stack)
-    state = State(robot.full_theta, robot.kernel.world_T_base, robot.kernel.flange_T_tool)
+    state = State(robot.kernel.theta0, robot.kernel.world_T_base, robot.kernel.flange_T_tool)
     white = whitening(evaluator, state)
     r, A = Problem(evaluator, robot.columns, white).blocks(state)
-    Jq = white @ evaluator(state).B @ robot.kernel.joint_jacobian(robot.full_theta, poses)
+    Jq = white @ evaluator(state).B @ robot.kernel.joint_jacobian(robot.kernel.theta0, poses)
     names = [(k, m) for k in range(1, poses.q.shape[1] + 1) for m in range(1, HIGHEST_ORDER + 1)]
     columns = [Jq[:, :, k - 1] * wave(m * poses.q[:, k - 1])[:, None] for k, m in names for wave in (np.cos, np.sin)]
     p, rows = A.shape[2], r.size

@@ -74,7 +74,7 @@ def one(seed: int) -> tuple[dict[str, list[np.ndarray]], dict[str, np.ndarray], 
     }
     loads: dict[str, np.ndarray] = {}
     for load in kernel.model.payloads:
-        wanted = nominal.kernel.frames(nominal.full_theta, random_poses(kernel, rng, 40, load))
+        wanted = nominal.kernel.frames(nominal.kernel.theta0, random_poses(kernel, rng, 40, load))
         sent = compensate(robot.model, wanted, payload=load)
         good = sent.reachable
         q = sent.q[good] + REPEATABILITY * rng.normal(size=(int(good.sum()), 6))

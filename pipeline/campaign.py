@@ -304,7 +304,8 @@ class _Reader:
         names = tuple(sorted({name for source in cameras.values() for name in source.names}))
         n = len(names)
         rows = np.zeros(n, dtype=np.int64)
-        return Poses(self.path, names, rows, np.zeros((n, 0)), (None,) * n, np.zeros(n, bool), np.zeros((n, 0)))
+        none = np.zeros((n, 0))
+        return Poses(names, none, (None,) * n, np.zeros(n, bool), none, path=self.path, rows=rows)
 
     def _check_targets(self, table: MeasuredTable, bodies: Mapping[str, BodySource]) -> None:
         if table.kind not in ("points", "sensor_points") or not bodies:

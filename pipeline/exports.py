@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pipeline.calibrated import load_calibrated
 from pipeline.files import write_text
 from pipeline.runs import open_run
+from pipeline.stages.identify import load_calibrated
 from robcal.robot.export.c_export import export_c
-from robcal.robot.urdf import urdf_text
+from robcal.robot.export.urdf import urdf_text
 
 
 def export_run(folder: Path, c: Path | None, urdf: Path | None) -> list[Path]:

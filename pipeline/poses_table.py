@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -12,61 +12,31 @@ from numpy.typing import NDArray
 
 from pipeline.schemas import proposal, shown
 from pipeline.tables import Table, read_table
+from robcal.calibration.joint_log import JointLog, approach_from_order
 from robcal.errors import InvalidInput
 from robcal.robot.model import RobotModel
 from robcal.transforms import Array
 
 LIMIT_SLACK = 1e-3
 """Poses may lie this much (rad or m) beyond a limit: controllers round."""
-RESTING = np.radians(1e-4)
-"""A joint that moved less than this (rad or m) from one pose to the next did not move."""
 NO_PAYLOAD = frozenset({"", "none", "-", "0"})
 
 
-@dataclass(frozen=True)
-class Poses:
+@dataclass(frozen=True, kw_only=True)
+class Poses(JointLog):
     """The joint log of a campaign.
 
     Attributes
     ----------
-    names : (n,) pose ids; rows : row numbers in the file.
-    q : (n, joints) rad or m, as commanded.
-    payload : (n,) name of the load, None without.
-    verify : (n,) true for poses that are kept out of the identification.
-    approach : (n, joints) -1, 0, +1; inferred : true where it was taken from the order of the poses.
-    covariates : further numeric columns by name (``time_s``, ``temp_<place>_c``, any other), as in the file.
+    path : of the table; rows : (n,) row numbers in it.
     notes : what was assumed or ignored, in words.
     outside : the first pose beyond the robot's ranges, in words; empty if all are within.
     """
 
     path: Path
-    names: tuple[str, ...]
     rows: NDArray[np.int64] = field(repr=False)
-    q: Array = field(repr=False)
-    payload: tuple[str | None, ...] = field(repr=False)
-    verify: NDArray[np.bool_] = field(repr=False)
-    approach: Array = field(repr=False)
-    approach_inferred: bool = False
-    covariates: Mapping[str, Array] = field(default_factory=dict, repr=False)
     notes: tuple[str, ...] = ()
     outside: str = ""
-
-    def __len__(self) -> int:
-        return len(self.names)
-
-
-def approach_from_order(q: Array) -> Array:
-    """Direction (n, joints) in which each joint last moved when the poses were driven one after the other.
-
-    The first pose of a joint that has not moved yet gets 0. Weakness: the way between two poses is not known, only
-    its ends.
-    """
-    step = np.diff(q, axis=0, prepend=q[:1])
-    direction = np.where(np.abs(step) > RESTING, np.sign(step), 0.0)
-    for i in range(1, len(direction)):
-        still = direction[i] == 0
-        direction[i, still] = direction[i - 1, still]
-    return direction
 
 
 def joint_columns(robot: RobotModel) -> list[tuple[str, float]]:
@@ -95,7 +65,8 @@ def read_poses(path: Path, robot: RobotModel | None, payloads: Collection[str], 
     table.unique(["pose"])
     n = len(names)
     if robot is None:
-        return Poses(path, names, table.rows, np.zeros((n, 0)), (None,) * n, np.zeros(n, bool), np.zeros((n, 0)))
+        none = np.zeros((n, 0))
+        return Poses(names, none, (None,) * n, np.zeros(n, bool), none, path=path, rows=table.rows)
     joints = joint_columns(robot)
     _check_joint_columns(table, [name for name, _ in joints])
     q = np.column_stack([table.numbers(name) * factor for name, factor in joints])

@@ -10,18 +10,17 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.calibrated import Calibrated, load_calibrated, predicted
 from pipeline.files import write_text
 from pipeline.frame_tables import SIX, frame_columns, sigma_columns
 from pipeline.poses_table import joint_columns, parse_payload, read_poses
 from pipeline.runs import open_run
+from pipeline.stages.identify import load_calibrated
 from pipeline.tables import read_table, write_table
 from robcal.errors import InvalidInput
 from robcal.robot.compensation import cell_frames, compensate
 from robcal.robot.export.controller_formats import frame_program, joint_program
-from robcal.robot.kernel import Kernel
 from robcal.robot.model import RobotModel
-from robcal.transforms import Array, difference, frame_from_xyzrpy
+from robcal.transforms import Array, frame_from_xyzrpy
 
 
 def predict_run(folder: Path, poses: Path, out: Path, *, nominal: bool = False) -> dict[str, Any]:
@@ -33,9 +32,10 @@ def predict_run(folder: Path, poses: Path, out: Path, *, nominal: bool = False) 
     """
     calibrated = load_calibrated(open_run(folder))
     wanted = read_poses(poses, calibrated.model, calibrated.model.payloads, to_predict=True)
-    T, covariance = predicted(calibrated, wanted, nominal=nominal)
+    robot = calibrated.bare() if nominal else calibrated
+    T, covariance = robot.predict(robot.inputs(wanted))
     columns: dict[str, Sequence[object]] = {"pose": wanted.names, **frame_columns(T)}
-    if covariance is not None:
+    if not nominal:
         columns.update(sigma_columns(T, covariance))
     write_table(out, columns)
     warnings = [f"predicted all the same: {wanted.outside}"] if wanted.outside else []
@@ -91,15 +91,14 @@ def compensate_run(
     calibrated = load_calibrated(open_run(folder))
     model = calibrated.model
     wanted = read_wanted(frames, model.payloads)
-    kernel = Kernel(model, calibrated.statics)
     covariates = {name: np.full(len(wanted.T), value) for name, value in calibrated.defaults.items()}
     covariates.update(wanted.covariates)
     result = compensate(
-        kernel,
+        calibrated.kernel,
         wanted.T,
         payload=wanted.payload,
         covariates=covariates,
-        near=_nearest_recorded(calibrated, kernel, wanted.T, in_base),
+        near=calibrated.nearest_recorded(cell_frames(calibrated.kernel)[0] @ wanted.T if in_base else wanted.T),
         frame="base" if in_base else "world",
     )
     unreachable = np.flatnonzero(~result.reachable)
@@ -143,16 +142,3 @@ def _program(model: RobotModel, values: Array, dialect: str, as_frames: bool, ou
     if as_frames:
         return frame_program(values, dialect, name, model.flange_T_tool)
     return joint_program(model, values, dialect, name)
-
-
-def _nearest_recorded(calibrated: Calibrated, kernel: Kernel, wanted: Array, in_base: bool) -> Array:
-    """Joint angles of the recorded pose whose tool is nearest, for each wanted frame: its configuration is kept."""
-    tools = calibrated.tools
-    if in_base:
-        wanted = cell_frames(kernel)[0] @ wanted
-    near = np.empty((len(wanted), calibrated.q.shape[1]))
-    for i, T in enumerate(wanted):
-        twist = difference(tools, T)
-        # half a metre of lever makes a turn comparable to a way
-        near[i] = calibrated.q[np.argmin(np.sum(twist[:, :3] ** 2, axis=1) + 0.25 * np.sum(twist[:, 3:] ** 2, axis=1))]
-    return near

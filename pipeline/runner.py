@@ -14,10 +14,11 @@ from pipeline.campaign import Campaign, all_sources, read_campaign
 from pipeline.codec import StaleCache
 from pipeline.files import storage_error
 from pipeline.messages import Messages
-from pipeline.runs import RUN_FORMAT, Run, StageRecord, code_version, fingerprint, read_json, run_file, write_json
+from pipeline.runs import RUN_FORMAT, Run, StageRecord, fingerprint, read_json, run_file, write_json
 from pipeline.schemas import proposal
+from pipeline.sources import code_version
 from pipeline.stages.base import Context, Outcome, Stage
-from pipeline.stages.joint_log import check_joint_limits
+from pipeline.stages.identify import check_joint_limits
 from pipeline.stages.registry import STAGES
 from robcal.errors import InvalidInput, RobcalError
 
@@ -217,7 +218,7 @@ def stage_key(stage: Stage, context: Context, applying: Sequence[str]) -> str:
         upstream[name] = dict(record.outputs) if record else None
     # the index of images holds their places; everything else is the same wherever the campaign lies
     alone = context.body if stage.name == "survey" else str(home) if stage.name == "detect" else None
-    return fingerprint(stage.name, files, stage.settings(campaign), upstream, code_version(*stage.code), alone)
+    return fingerprint(stage.name, files, stage.settings(campaign), upstream, code_version(stage.module), alone)
 
 
 def _name_within(path: Path, home: Path) -> str:

@@ -11,12 +11,9 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import cache
 from pathlib import Path
 from typing import Any
 
-import pipeline
-import robcal
 from pipeline import codec
 from pipeline.files import sha256_of, storage_error, write_text
 from robcal.errors import InvalidInput, RobcalError
@@ -350,20 +347,6 @@ def plain(value: Any) -> Any:
     if isinstance(value, Path):
         return str(value)
     return value
-
-
-@cache
-def code_version(*parts: str) -> str:
-    """Hash of the sources of packages or modules, such as ``robcal/imaging`` or ``pipeline/stages/detect.py``."""
-    roots = {"robcal": Path(robcal.__file__).parent, "pipeline": Path(pipeline.__file__).parent}
-    digest = hashlib.sha256()
-    for part in parts:
-        top, _, rest = part.partition("/")
-        place = roots[top] / rest if rest else roots[top]
-        for file in sorted(place.rglob("*.py")) if place.is_dir() else [place]:
-            digest.update(str(file.relative_to(roots[top])).encode())
-            digest.update(file.read_bytes())
-    return digest.hexdigest()
 
 
 def fingerprint(*pieces: Any) -> str:

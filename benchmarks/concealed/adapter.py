@@ -76,15 +76,15 @@ def _frames(path: Path) -> Array:
 def library(folder: Path, tables: Mapping[str, Path]) -> Answer:
     """In this process: campaign reader, identification and diagnosis, without stages and reports."""
     from pipeline.bodies import body_for_robot
-    from pipeline.calibrated import recorded_inputs
     from pipeline.campaign import read_campaign
     from pipeline.runs import Run
-    from pipeline.stages.diagnose import optional_parameters, own_elasticities
-    from pipeline.stages.identify import identify_recording, options_of, require_robot
+    from pipeline.stages.identify import options_of, require_robot
     from pipeline.stages.observations import build_recording
+    from robcal.calibration.variance_components import identify_recording
     from robcal.diagnosis.content import as_contract
     from robcal.diagnosis.core.recording import Recording
     from robcal.diagnosis.diagnose import diagnose
+    from robcal.recipe.robot_diagnosis import optional_parameters, own_elasticities
     from robcal.robot.kernel import Kernel
 
     start = time.process_time()  # of this one core, whatever else runs on the machine
@@ -96,11 +96,9 @@ def library(folder: Path, tables: Mapping[str, Path]) -> Answer:
     kernel = Kernel(robot, campaign.entry.model.statics)
     rows = np.flatnonzero(~poses.verify)
     found, measured = identify_recording(
-        robot, recorded_inputs(kernel, poses), measured, rows, options_of(campaign, measured.stated), kernel
+        robot, poses.inputs(kernel), measured, rows, options_of(campaign, measured.stated), kernel
     )
-    covariates = {name: np.asarray(v, dtype=float) for name, v in poses.covariates.items()}
-    covariates |= {f"approach{k + 1}": poses.approach[:, k] for k in range(poses.q.shape[1])}
-    covariates["index"] = np.arange(len(poses), dtype=float)
+    covariates = poses.recorded()
 
     def recording(chosen: Array) -> Recording | None:
         if not len(chosen):
@@ -132,7 +130,6 @@ def library(folder: Path, tables: Mapping[str, Path]) -> Answer:
 def _predicted(
     model: Any, campaign: Any, recorded: Mapping[str, Array], tables: Mapping[str, Path]
 ) -> dict[str, Array]:
-    from pipeline.calibrated import recorded_inputs
     from pipeline.poses_table import read_poses
     from robcal.robot.kernel import Kernel
 
@@ -140,7 +137,7 @@ def _predicted(
     predicted = {}
     for name, table in tables.items():
         poses = read_poses(table, campaign.robot, campaign.robot.payloads, to_predict=True)
-        inputs = recorded_inputs(kernel, poses)
+        inputs = poses.inputs(kernel)
         after = {**inputs.covariates, "index": np.full(len(poses), float(len(recorded["index"])))}
         predicted[name] = kernel.frames(kernel.theta0, kernel.poses(poses.q, poses.payload, after))
     return predicted

@@ -136,7 +136,7 @@ def own_gain(root: Path, truth: OwnTruth) -> dict[str, Any]:
     run, table = Run(root / "run"), root / "campaign" / "kept_out.csv"
     true = kept_out_frames(truth) @ true_T_surveyed(truth, root / "run" / "bodies" / "plate.yaml")
     out = {"before_inside": tip_error_mm(_predicted(_fitted(root / "campaign", run), table), true)}
-    out["after_inside"] = tip_error_mm(_predicted(run.load("calibrated_diagnose"), table), true)
+    out["after_inside"] = tip_error_mm(_predicted(run.load("calibrated"), table), true)
     plan = {name: value for name, value in vars(truth.plan).items() if name != "effects"}
     healthy = make_own(root / "healthy", effects=(), **plan)
     run_campaign(root / "healthy", root / "healthy_run", until="identify")
@@ -160,26 +160,26 @@ def true_T_surveyed(truth: OwnTruth, surveyed: Path) -> Array:
 def _fitted(folder: Path, run: Any) -> Any:
     """The identified robot fitted once more beside the errors of its station, without any further physics."""
     from pipeline.bodies import body_for_robot
-    from pipeline.calibrated import with_folded_cell
     from pipeline.campaign import read_campaign
-    from pipeline.stages.diagnose import own_elasticities, recording_for_diagnosis
     from pipeline.stages.identify import load_identification, require_robot
+    from robcal.calibration.calibrated import with_folded_cell
     from robcal.diagnosis.core.fitting import fit
+    from robcal.recipe.recording import recording_for_diagnosis
+    from robcal.recipe.robot_diagnosis import own_elasticities
 
     campaign = read_campaign(folder)
     _, poses = require_robot(campaign)
     found = load_identification(run)
     body, points, station = body_for_robot(campaign, run), run.load("points"), run.load("orient")
     recording = recording_for_diagnosis(poses, found.recording, found.rows, body, points, station)
-    robot = found.robot()
+    robot = found.robot
     model = fit(robot.model, recording, (*robot.names, *own_elasticities(robot))).model
-    return replace(run.load("calibrated_identify"), model=with_folded_cell(model), statics="converged")
+    return replace(robot, model=with_folded_cell(model), statics="converged")
 
 
 def _predicted(calibrated: Any, table: Path) -> Array:
-    from pipeline.calibrated import predicted
     from pipeline.poses_table import read_poses
 
     poses = read_poses(table, calibrated.model, calibrated.model.payloads, to_predict=True)
-    frames: Array = predicted(calibrated, poses)[0]
+    frames: Array = calibrated.predict(calibrated.inputs(poses))[0]
     return frames

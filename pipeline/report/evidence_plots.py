@@ -8,7 +8,7 @@ import numpy as np
 
 from pipeline.report.blocks import Figure
 from pipeline.report.style import ACCENT, AFTER, BEFORE, GREEN, GREY, INK, label, layout, rounded
-from pipeline.stages.evidence import CauseEvidence
+from robcal.recipe.evidence import CauseEvidence
 from robcal.transforms import Array
 
 _STATES = {-1.0: (BEFORE, "moved down"), 0.0: (GREY, "approach unknown"), 1.0: (AFTER, "moved up")}

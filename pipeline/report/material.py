@@ -124,7 +124,8 @@ class Material:
     @cached_property
     def calibrated(self) -> Any:
         """The calibrated robot with what the diagnosis added."""
-        return self.artifact("calibrated_diagnose", "diagnose") or self.artifact("calibrated_identify", "identify")
+        found = self.artifact("calibrated", "diagnose")
+        return found if found is not None or self.identification is None else self.identification.robot
 
     @cached_property
     def verification(self) -> tuple[Verification, Any] | None:

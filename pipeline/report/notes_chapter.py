@@ -19,11 +19,11 @@ def rejected_chapter(material: Material) -> Chapter:
             f"pose {material.pose_name(p.pose)}, target {p.target}: {p.reason}" for p in material.frames.rejected_points
         ]
     if material.identification is not None:
-        rows, facts = material.identification.rows, material.identification.facts
+        rows, found = material.identification.rows, material.identification.robot
         items += [
             f"pose {material.pose_name(int(rows[i]))}: contradicts all others (normalised error "
-            f"{facts['normalised'][i]:.1f}), left out of the identification"
-            for i in facts["outliers"]
+            f"{found.normalised[i]:.1f}), left out of the identification"
+            for i in found.outliers
         ]
     if material.diagnosis:
         items += [

@@ -10,6 +10,7 @@ import numpy as np
 from pipeline.report.blocks import Block, Chapter, Table, Text, table
 from pipeline.report.material import Material
 from pipeline.report.style import number, to_sigma
+from robcal.calibration.identification import IdentifiedRobot
 from robcal.robot.kernel import Kernel
 from robcal.robot.model import RobotModel, parameter_unit
 from robcal.transforms import xyzrpy_from_frame
@@ -26,7 +27,7 @@ def parameter_chapter(material: Material) -> Chapter:
         if calibrated.model.terms:
             blocks.append(_terms(calibrated.model))
     if identification is not None:
-        blocks += _gauges(identification.facts, calibrated is not None and bool(calibrated.model.terms))
+        blocks += _gauges(identification.robot, calibrated is not None and bool(calibrated.model.terms))
     return Chapter(
         "parameters",
         "Identified parameters",
@@ -112,18 +113,18 @@ def _readable(expression: str) -> str:
     return re.sub(r"\d+\.\d{4,}(?:e[-+]?\d+)?", lambda found: f"{float(found[0]):.4g}", expression)
 
 
-def _gauges(facts: Any, diagnosed: bool) -> list[Block]:
+def _gauges(found: IdentifiedRobot, diagnosed: bool) -> list[Block]:
     blocks: list[Block] = []
-    eliminated = facts["eliminated"]
+    eliminated = found.eliminated
     rows = []
     for name, e in sorted(eliminated.items()):
         ties = sorted(((n, s) for n, s in e.tied_to.items() if abs(s) > 0.05), key=lambda p: -abs(p[1]))
         rows.append([name, str(e.reason), ", ".join(n for n, _ in ties[:6]) or "–"])
     sentence = (
-        f"{len(facts['names'])} parameters from {int(facts['used'].sum())} poses, {facts['iterations']} iterations in "
-        f"{facts['seconds']:.2f} s. Condition of the scaled normal equations {number(facts['condition'])} (of the raw "
-        f"ones {number(facts['condition_raw'])}), redundancy {facts['redundancy']}, sigma0 {number(facts['sigma0'])} "
-        f"(one where residuals agree with the stated covariance; p = {number(facts['p_value'], 2)})."
+        f"{len(found.names)} parameters from {int(found.used.sum())} poses, {found.iterations} iterations in "
+        f"{found.seconds:.2f} s. Condition of the scaled normal equations {number(found.condition)} (of the raw "
+        f"ones {number(found.condition_raw)}), redundancy {found.redundancy}, sigma0 {number(found.sigma0)} "
+        f"(one where residuals agree with the stated covariance; p = {number(found.p_value, 2)})."
     )
     blocks.append(Text(f"Before the diagnosis added its terms: {sentence}" if diagnosed else sentence))
     if rows:
@@ -136,9 +137,9 @@ def _gauges(facts: Any, diagnosed: bool) -> list[Block]:
                 shown=12,
             )
         )
-    correlation = np.asarray(facts["correlations"])
+    correlation = np.asarray(found.correlations)
     if correlation.ndim == 2 and len(correlation):
-        names = facts["names"]
+        names = found.names
         i, j = np.nonzero(np.triu(np.abs(correlation), 1) > 0.95)
         order = np.argsort(-np.abs(correlation[i, j]))[:30]
         pairs = [[names[i[k]], names[j[k]], f"{correlation[i[k], j[k]]:+.3f}"] for k in order]

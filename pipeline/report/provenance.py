@@ -9,7 +9,8 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from pipeline.report.material import Material
-from pipeline.runs import code_version, plain
+from pipeline.runs import plain
+from pipeline.sources import all_modules, code_version
 
 _LIBRARIES = ("numpy", "scipy", "casadi", "opencv-contrib-python-headless", "pycolmap")
 
@@ -32,7 +33,7 @@ def provenance(material: Material) -> Provenance:
     """Version of the program, inputs and settings. No time of writing: the same run gives the same report."""
     facts = [
         ("campaign", str(material.campaign_folder)),
-        ("program", f"robcal {_version('robcal')}, sources {code_version('robcal', 'pipeline')[:16]}"),
+        ("program", f"robcal {_version('robcal')}, sources {code_version(*all_modules())[:16]}"),
         ("Python", platform.python_version()),
         ("libraries", ", ".join(f"{name} {_version(name)}" for name in _LIBRARIES)),
         ("stages", ", ".join(material.stages)),

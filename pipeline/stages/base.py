@@ -47,7 +47,7 @@ class Stage:
     applies : whether the campaign has input for it.
     inputs : files of the campaign it reads; settings : entries of campaign.yaml (and else) it depends on.
     after : stages whose outputs it reads.
-    code : packages and modules whose change makes its results out of date.
+    module : the module that defines it; a change in what that can reach makes its results out of date.
     """
 
     name: str
@@ -56,7 +56,7 @@ class Stage:
     inputs: Callable[[Campaign], Sequence[Path]]
     settings: Callable[[Campaign], Any]
     after: tuple[str, ...]
-    code: tuple[str, ...]
+    module: str
 
 
 def no_files(campaign: Campaign) -> Sequence[Path]:

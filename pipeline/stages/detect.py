@@ -13,7 +13,8 @@ from pipeline.campaign import Campaign, ImageSource
 from pipeline.campaign_schema import SurveyEntry
 from pipeline.images import read_image
 from pipeline.parallel import in_processes
-from pipeline.runs import Run, code_version, fingerprint
+from pipeline.runs import Run, fingerprint
+from pipeline.sources import code_version
 from pipeline.stages.base import Context, Outcome, Stage
 from robcal.errors import InvalidInput, RobcalError
 from robcal.imaging.detect import detect_targets
@@ -21,9 +22,6 @@ from robcal.imaging.detections import Detections
 from robcal.imaging.settings import DetectionSettings
 
 NAME = "detect"
-CODE = ("robcal/imaging", "robcal/errors.py", "pipeline/images.py", "pipeline/stages/detect.py")
-
-
 _MANY = 12
 
 
@@ -138,7 +136,7 @@ def work(context: Context) -> Outcome:
     campaign, run = context.campaign, context.run
     jobs: list[_Job] = []
     hashes: dict[str, dict[str, str]] = {}
-    version = code_version(*CODE)
+    version = code_version("pipeline.images", "robcal.imaging.detect")
     for source, (images, body, survey) in sources(campaign).items():
         settings = settings_for(body, survey)
         for name, path in images.images.items():
@@ -219,5 +217,5 @@ STAGE = Stage(
         for source, (images, body, survey) in sources(campaign).items()
     },
     after=(),
-    code=(*CODE, "pipeline/body_file.py"),
+    module=__name__,
 )

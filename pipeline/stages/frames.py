@@ -123,5 +123,5 @@ STAGE = Stage(
     inputs=lambda campaign: [body.file.path for body in campaign.bodies.values()],
     settings=lambda campaign: campaign.entry.model_dump(include={"quality", "body"}),
     after=("survey", "orient", "measure"),
-    code=("robcal/photogrammetry", "robcal/transforms.py", "pipeline/stages/frames.py", "pipeline/bodies.py"),
+    module=__name__,
 )

@@ -2,51 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
 
 from pipeline.bodies import body_for_robot
-from pipeline.calibrated import Calibrated, defaults_of, recorded_inputs
 from pipeline.campaign import Campaign
 from pipeline.poses_table import Poses
 from pipeline.robot_file import write_robot
 from pipeline.runs import Run
 from pipeline.stages.base import Context, Outcome, Stage
-from pipeline.stages.joint_log import check_failed_fit, check_joint_log
-from pipeline.stages.observations import RobotObservations, RobotRecording, Rows, build_recording, rescaled
-from robcal.calibration.identification import IdentifiedRobot, IdentifyOptions, identify
-from robcal.calibration.observations import FrameObservations
-from robcal.calibration.verification import fit_nominal
-from robcal.errors import InvalidInput
-from robcal.robot.kernel import Kernel, PoseInputs
+from pipeline.stages.observations import build_recording
+from pipeline.stages.survey import located
+from robcal.calibration.calibrated import CalibratedRobot
+from robcal.calibration.identification import IdentifiedRobot, IdentifyOptions
+from robcal.calibration.measurements import Rows
+from robcal.calibration.recording_faults import fault_of
+from robcal.errors import InvalidInput, RobcalError
+from robcal.recipe.identification import Identification, identify_robot
+from robcal.robot.kernel import Kernel
 from robcal.robot.model import RobotModel
-from robcal.transforms import Array
 
 NAME = "identify"
-
-
-@dataclass(frozen=True)
-class Identification:
-    """What the stages after it need.
-
-    Attributes
-    ----------
-    rows : (n,) rows in the table of poses of the poses that were identified from.
-    facts : the fields of :class:`IdentifiedRobot` except its kernel, which is built again from the model.
-    recording : the measurements, with the uncertainty estimated where none was stated.
-    """
-
-    rows: Rows
-    facts: Mapping[str, Any] = field(repr=False)
-    recording: RobotRecording = field(repr=False)
-
-    def robot(self) -> IdentifiedRobot:
-        """The identified robot with its kernel."""
-        model, options = self.facts["model"], self.facts["options"]
-        return IdentifiedRobot(kernel=Kernel(model, options.statics), **self.facts)
 
 
 def options_of(campaign: Campaign, stated: bool) -> IdentifyOptions:
@@ -67,23 +44,35 @@ def work(context: Context) -> Outcome:
     campaign, run = context.campaign, context.run
     robot, poses = require_robot(campaign)
     recording = build_recording(campaign, run, body_for_robot(campaign, run))
-    rows = np.array([i for i in recording.poses if not poses.verify[i]], dtype=np.int64)
-    if not len(rows):
-        raise InvalidInput(f"{poses.path}: no measured pose is left to identify from: set 'identify' in the column set")
-    kernel = Kernel(robot, campaign.entry.model.statics)
-    inputs = recorded_inputs(kernel, poses)
-    options = options_of(campaign, recording.stated)
-    check_joint_log(robot, poses, inputs, recording, kernel)
-    nominal = fit_nominal(robot, inputs.subset(rows), recording.select(rows))
-    found, recording = identify_recording(robot, inputs, recording, rows, options, kernel)
-    if recording.stated:
-        check_failed_fit(robot, poses, inputs, recording, kernel, found)
-    calibrated = calibrated_robot(poses, inputs, found, nominal.model)
-    facts = {f.name: getattr(found, f.name) for f in fields(found) if f.name != "kernel"}
-    outputs = [run.save(NAME, Identification(rows, facts, recording)), run.save(f"calibrated_{NAME}", calibrated)]
-    write_robot(run.robot, found.model, f"calibrated from campaign {campaign.name}, before the diagnosis")
-    notes = [*recording.notes, *_notes(found, poses, rows)]
-    return Outcome({"identification": _result(found, rows)}, outputs, notes)
+    try:
+        found = identify_robot(robot, poses, recording, options_of(campaign, recording.stated))
+    except InvalidInput as error:
+        raise located(error, str(poses.path)) from None
+    outputs = [run.save(NAME, found)]
+    write_robot(run.robot, found.robot.model, f"calibrated from campaign {campaign.name}, before the diagnosis")
+    notes = [*found.recording.notes, *_notes(found.robot, poses, found.rows)]
+    return Outcome({"identification": _result(found.robot, found.rows)}, outputs, notes)
+
+
+def check_joint_limits(campaign: Campaign, run: Run) -> None:
+    """Refuse poses beyond the robot's ranges; where a slip in the recording explains them, name it with the proof.
+
+    Raises
+    ------
+    InvalidInput : some pose is beyond a range of the robot file.
+    """
+    poses, robot = campaign.poses, campaign.robot
+    if poses is None or robot is None or not poses.outside:
+        return
+    fault = ""
+    if campaign.measurements:
+        kernel = Kernel(robot, campaign.entry.model.statics)
+        try:
+            recording = build_recording(campaign, run, body_for_robot(campaign, run))
+            fault = fault_of(robot, poses.inputs(kernel), recording, kernel)
+        except RobcalError:
+            fault = ""  # what else is wrong comes to light once the angles are within the ranges
+    raise InvalidInput(poses.outside + (f"; a likely cause: {fault}" if fault else ""))
 
 
 def require_robot(campaign: Campaign) -> tuple[RobotModel, Poses]:
@@ -96,67 +85,6 @@ def require_robot(campaign: Campaign) -> tuple[RobotModel, Poses]:
     if campaign.robot is None or campaign.poses is None:
         raise InvalidInput(f"{campaign.path}: no robot or no poses: add 'robot' and 'poses'")
     return campaign.robot, campaign.poses
-
-
-def identify_recording(
-    robot: RobotModel,
-    inputs: PoseInputs,
-    recording: RobotRecording,
-    rows: Rows,
-    options: IdentifyOptions,
-    kernel: Kernel,
-) -> tuple[IdentifiedRobot, RobotRecording]:
-    """Identify; where no uncertainty is stated, estimate variance components from the residuals and do so again."""
-    subset = inputs.subset(rows)
-    found = identify(robot, subset, recording.select(rows), options, kernel)
-    for _ in range(0 if recording.stated else 2):
-        factors = variance_factors(found, subset, recording.select(rows), recording.observations)
-        observations = rescaled(recording.observations, factors)
-        # points tell by their body how they scatter; what they carry, frames, follows the robot's residuals
-        pairs = zip(recording.detailed, recording.observations, observations, strict=True)
-        detailed = tuple(new if own is old else own for own, old, new in pairs)
-        recording = replace(recording, observations=observations, detailed=detailed)
-        found = identify(robot, subset, recording.select(rows), options, kernel)
-    return found, recording
-
-
-def variance_factors(
-    found: IdentifiedRobot, inputs: PoseInputs, used: Sequence[RobotObservations], kinds: Sequence[RobotObservations]
-) -> list[Array]:
-    """Factor by which the variances of each kind are too small: (2,) position and rotation of frames, else (1,).
-
-    Every group's sum of squares is set against its share of the redundancy, which is taken as even.
-    """
-    T = found.kernel.frames(found.full_theta, inputs)
-    share = found.redundancy / max(found.redundancy + len(found.names), 1)
-    factors: list[Array] = []
-    remaining = list(used)
-    for kind in kinds:
-        mine = next((o for o in remaining if type(o) is type(kind)), None)
-        if mine is None:
-            factors.append(np.ones(2 if isinstance(kind, FrameObservations) else 1))
-            continue
-        remaining.remove(mine)
-        keep = found.used[mine.pose]
-        r, _ = mine.evaluate(T)
-        white = np.linalg.solve(np.linalg.cholesky(mine.noise(T)), r[..., None])[..., 0][keep]
-        groups = [white[:, :3], white[:, 3:]] if isinstance(kind, FrameObservations) else [white]
-        factors.append(np.array([max(float(np.mean(g**2)) / max(share, 0.05), 1e-12) for g in groups]))
-    return factors
-
-
-def calibrated_robot(poses: Poses, inputs: PoseInputs, found: IdentifiedRobot, nominal: RobotModel) -> Calibrated:
-    """The calibrated robot beside the nominal one in its best cell, with what predictions need."""
-    return Calibrated(
-        model=found.model,
-        nominal=nominal,
-        statics=found.options.statics,
-        names=tuple(found.names),
-        covariance=found.covariance,
-        q=poses.q,
-        tools=found.kernel.frames(found.full_theta, inputs),
-        defaults=defaults_of(poses),
-    )
 
 
 def _result(found: IdentifiedRobot, rows: Rows) -> dict[str, Any]:
@@ -194,6 +122,21 @@ def load_identification(run: Run) -> Identification:
     return found
 
 
+def load_calibrated(run: Run) -> CalibratedRobot:
+    """The robot with all that was found out about it: after the diagnosis where there was one.
+
+    Raises
+    ------
+    InvalidInput : the run has no calibrated robot.
+    """
+    if run.record("diagnose") is not None and run.has("calibrated"):
+        found: CalibratedRobot = run.load("calibrated")
+        return found
+    if run.record(NAME) is not None and run.has(NAME):
+        return load_identification(run).robot
+    raise InvalidInput(f"{run.folder}: holds no calibrated robot: the campaign needs a robot, poses and measurements")
+
+
 STAGE = Stage(
     name=NAME,
     applies=lambda campaign: campaign.robot is not None and campaign.poses is not None,
@@ -201,14 +144,5 @@ STAGE = Stage(
     inputs=lambda campaign: [p for p in campaign.files if p.suffix.lower() in {".csv", ".yaml", ".yml"}],
     settings=lambda campaign: campaign.entry.model_dump(include={"model", "payloads", "measurements", "body"}),
     after=("survey", "measure", "frames"),
-    code=(
-        "robcal/calibration",
-        "robcal/robot",
-        "robcal/estimation",
-        "robcal/transforms.py",
-        "pipeline/stages/identify.py",
-        "pipeline/stages/observations.py",
-        "pipeline/stages/joint_log.py",
-        "pipeline/calibrated.py",
-    ),
+    module=__name__,
 )

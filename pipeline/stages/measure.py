@@ -80,5 +80,5 @@ STAGE = Stage(
     inputs=lambda campaign: [table.path for table in campaign.measured("points")],
     settings=lambda campaign: [list(campaign.poses.names) if campaign.poses else [], campaign.entry.measurements],
     after=("detect", "survey", "orient"),
-    code=("robcal/photogrammetry", "pipeline/stages/measure.py"),
+    module=__name__,
 )

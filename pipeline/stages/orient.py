@@ -4,29 +4,23 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from pipeline.adjusted_images import CORRECTED_IMAGES, SHAPES, image_covariates
 from pipeline.bodies import surveyed_or_given
 from pipeline.camera_file import CameraFile, write_camera
 from pipeline.campaign import Campaign, ImageSource
-from pipeline.image_findings import SHAPES, TAKEN_BACK, image_covariates, light_of
 from pipeline.measurement_tables import MarksTable
-from pipeline.moved_cameras import robot_misfit
 from pipeline.poses_table import Poses
 from pipeline.runs import Run
 from pipeline.stages.base import Context, Outcome, Stage
 from pipeline.stages.detect import DetectionIndex, load_detections
+from pipeline.stages.identify import options_of
 from pipeline.stages.survey import located, size_of_marks
-from robcal.diagnosis.images.camera_moves import which_moved, with_small_moves
-from robcal.diagnosis.images.data import ImageData
-from robcal.diagnosis.images.diagnosis import ImageFinding
-from robcal.diagnosis.images.dot_sizes import with_dot_sizes
-from robcal.diagnosis.images.light_lag import without_lag
-from robcal.diagnosis.images.station import station_data
 from robcal.errors import InvalidInput, RobcalError
 from robcal.imaging.detections import Detections
 from robcal.photogrammetry.core.bodies import Body
@@ -34,9 +28,10 @@ from robcal.photogrammetry.core.camera import INTRINSIC_NAMES, Camera
 from robcal.photogrammetry.measure.measured_points import MeasuredPoints
 from robcal.photogrammetry.measure.points import measure_points
 from robcal.photogrammetry.station.identify import identify_station
-from robcal.photogrammetry.station.network import StationMarks, StationOrientation, StationSettings
-from robcal.photogrammetry.station.orientation import orient_station
-from robcal.photogrammetry.station.seen_normals import ellipses_of, needs_normals, with_seen_normals
+from robcal.photogrammetry.station.network import StationMarks, StationOrientation
+from robcal.photogrammetry.station.seen_normals import ellipses_of
+from robcal.recipe.robot_witness import robot_misfit
+from robcal.recipe.station import StationImages, orient_images
 
 NAME = "orient"
 
@@ -56,48 +51,31 @@ def work(context: Context) -> Outcome:
     marks, problems = _marks(campaign, detections, body, poses, start)
     notes = _problem_notes(problems, poses)
     marks = _usable(campaign, marks, body, notes, problems)
-    stated = {
-        name: source.start.world_T_camera
-        for name, source in campaign.cameras.items()
-        if source.start is not None and source.start.world_T_camera is not None and name in marks
-    }
-    sizes = {name: _size(campaign.cameras[name], run, name) for name in marks}
-
-    carried = body
-    at_first: list[StationOrientation] = []
-    shapes = {name: ellipses_of(m, detections[name]) for name, m in marks.items() if name in detections}
-
-    def orient(settings: StationSettings) -> StationOrientation:
-        if at_first and settings == StationSettings():
-            return at_first[0]
-        return orient_station(marks, carried, {n: start[n] for n in marks}, sizes, stated, settings)
-
-    def data(orientation: StationOrientation) -> ImageData:
-        view = station_data(orientation, poses.names, body, start, image_covariates(campaign))
-        return replace(view, light=light_of(orientation, marks, shapes))
-
+    images = StationImages(
+        poses=poses.names,
+        body=body,
+        marks=marks,
+        shapes={name: ellipses_of(m, detections[name]) for name, m in marks.items() if name in detections},
+        start=start,
+        stated={
+            name: source.start.world_T_camera
+            for name, source in campaign.cameras.items()
+            if source.start is not None and source.start.world_T_camera is not None and name in marks
+        },
+        sizes={name: _size(campaign.cameras[name], run, name) for name in marks},
+        covariates=image_covariates(campaign),
+    )
+    robot = campaign.robot
+    misfit = None if robot is None else partial(robot_misfit, robot, poses, options_of(campaign, True))
     try:
-        if needs_normals(body):
-            carried = with_seen_normals(body, orient(StationSettings(detect_moves=False)), marks, shapes)
-        taken: tuple[ImageFinding, ...] = ()
-        if campaign.entry.diagnosis.enabled:
-            carried, taken = with_dot_sizes(carried, lambda: data(orient(StationSettings())))
-            at_first.append(orient(StationSettings()))
-            marks, lags = without_lag(marks, shapes, lambda: data(at_first[0]))
-            if lags:
-                taken = (*taken, *lags)
-                at_first.clear()
-            orientation, again = with_small_moves(orient, data)
-            if campaign.robot is not None:
-                orientation = which_moved(orientation, again, lambda tried: robot_misfit(campaign, tried, marks))
-        else:
-            orientation = orient(StationSettings())
+        found = orient_images(images, campaign.entry.diagnosis.enabled, misfit)
     except RobcalError as error:
         raise located(error, f"{campaign.path}: station") from None
-    outputs = [run.save(NAME, orientation), run.save("marks", marks), run.save(TAKEN_BACK, list(taken))]
-    outputs.append(run.save(SHAPES, shapes))
+    orientation, marks = found.orientation, dict(found.marks)
+    outputs = [run.save(NAME, orientation), run.save("marks", dict(marks))]
+    outputs += [run.save(CORRECTED_IMAGES, list(found.corrected)), run.save(SHAPES, dict(images.shapes))]
     outputs += _write_cameras(campaign, run, orientation)
-    notes += [f.statement for f in taken] + [e.statement for e in orientation.evidence]
+    notes += [f.statement for f in found.corrected] + [e.statement for e in orientation.evidence]
     whole = [r for r in orientation.rejected if r.target < 0]
     notes += [f"camera {r.camera}, pose '{poses.names[r.pose]}': {r.reason}" for r in whole]
     return Outcome({"station": _result(orientation, marks)}, outputs, notes)
@@ -249,16 +227,5 @@ STAGE = Stage(
         list(campaign.poses.names) if campaign.poses else [],
     ],
     after=("detect", "survey"),
-    code=(
-        "robcal/calibration",
-        "robcal/diagnosis",
-        "robcal/photogrammetry",
-        "robcal/robot",
-        "robcal/estimation",
-        "robcal/transforms.py",
-        "pipeline/image_findings.py",
-        "pipeline/moved_cameras.py",
-        "pipeline/stages/observations.py",
-        "pipeline/stages/orient.py",
-    ),
+    module=__name__,
 )

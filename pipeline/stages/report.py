@@ -29,5 +29,5 @@ STAGE = Stage(
     inputs=no_files,
     settings=lambda campaign: campaign.name,
     after=("detect", "survey", "orient", "measure", "frames", "identify", "diagnose", "verify"),
-    code=("pipeline/report", "pipeline/stages/report.py"),
+    module=__name__,
 )

@@ -281,12 +281,5 @@ STAGE = Stage(
     ],
     settings=lambda campaign: campaign.entry.model_dump(include={"bodies", "bundle"}),
     after=("detect",),
-    code=(
-        "robcal/photogrammetry",
-        "robcal/estimation",
-        "robcal/transforms.py",
-        "pipeline/stages/survey.py",
-        "pipeline/body_file.py",
-        "pipeline/camera_file.py",
-    ),
+    module=__name__,
 )

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robcal import transforms as tf
+from robcal.calibration.calibrated import CalibratedRobot
 from robcal.calibration.identifiability import check_poses, choose_candidates, observability_indices
 from robcal.calibration.observations import FrameObservations, Observations, Stack, basis_points
 from robcal.calibration.outliers import PoseStatistics, find_outliers, pose_statistics
@@ -60,16 +61,14 @@ class IdentifyOptions:
     termination: TerminationSettings = field(default_factory=lambda: TerminationSettings(negligible=1e-4))
 
 
-@dataclass(frozen=True)
-class IdentifiedRobot:
-    """A calibrated robot and what is known about it.
+@dataclass(frozen=True, kw_only=True)
+class IdentifiedRobot(CalibratedRobot):
+    """A calibrated robot and how its identification went.
 
     Attributes
     ----------
     model : parameters filled, references of base and tool set (their deviations folded in).
-    names, theta, covariance : identified parameters (p,), values, and covariance (p, p) after scaling; those of base
-        and tool are right perturbations of the references.
-    covariance_scale : factor applied to the covariance (sigma0 squared or one).
+    covariance : after scaling by covariance_scale (sigma0 squared or one).
     sigma0, redundancy, p_value : root of the whitened sum of squares over redundancy, and its chi-square test.
     eliminated : by name, why a candidate was not identified and what it is tied to.
     rejected_elasticities : p-values of the elasticities for which the data show no evidence.
@@ -81,12 +80,6 @@ class IdentifiedRobot:
         parameters; iterations counts all Gauss-Newton steps; seconds : kernel, start and solution.
     """
 
-    model: RobotModel
-    kernel: Kernel
-    names: tuple[str, ...]
-    theta: Array
-    covariance: Array
-    covariance_scale: float
     sigma0: float
     redundancy: int
     p_value: float
@@ -108,26 +101,6 @@ class IdentifiedRobot:
     iterations: int
     seconds: float
     seconds_kernel: float
-
-    @property
-    def sigma(self) -> Array:
-        """Standard deviations (p,)."""
-        return np.sqrt(np.diag(self.covariance))
-
-    @property
-    def values(self) -> dict[str, float]:
-        """Identified values by name; base and tool are zero, their values live in the references."""
-        return dict(zip(self.names, self.theta.tolist(), strict=True))
-
-    @property
-    def columns(self) -> NDArray[np.intp]:
-        """Indices of the identified parameters in the kernel's theta."""
-        return np.array([self.kernel.index[n] for n in self.names], dtype=np.intp)
-
-    @property
-    def full_theta(self) -> Array:
-        """All parameters of the kernel."""
-        return self.kernel.theta0
 
     def strong_correlations(self, level: float = 0.95) -> list[tuple[str, str, float]]:
         """Pairs of parameters correlated more than ``level``, strongest first."""
@@ -265,14 +238,12 @@ def _result(
     model = replace(
         kernel.model.with_parameters(values), world_T_base=state.world_T_base, flange_T_tool=state.flange_T_tool
     )
-    calibrated = kernel.with_references(state.world_T_base, state.flange_T_tool)
-    calibrated.model, calibrated.theta0 = model, state.theta
-    theta = state.theta[solution.problem.columns]
+    joint_sigma = np.sqrt(scale) * np.asarray(options.joint_sigma or 0.0, dtype=float)
     return IdentifiedRobot(
         model=model,
-        kernel=calibrated,
         names=solution.names,
-        theta=theta,
+        statics=options.statics,
+        joint_sigma=joint_sigma.tolist(),
         covariance=statistics.cofactor * scale,
         covariance_scale=scale,
         sigma0=sigma0,
@@ -297,15 +268,3 @@ def _result(
         seconds=time.perf_counter() - clock,
         seconds_kernel=seconds_kernel,
     )
-
-
-def predict_frames(robot: IdentifiedRobot | RobotModel, poses: PoseInputs) -> tuple[Array, Array]:
-    """Tool frames (n, 4, 4) and the covariance (n, 6, 6) of their right twist from that of the parameters.
-
-    For a bare model the covariance is zero.
-    """
-    if isinstance(robot, RobotModel):
-        kernel = Kernel(robot)
-        return kernel.frames(kernel.theta0, poses), np.zeros((len(poses), 6, 6))
-    T, J = robot.kernel.frames_and_jacobian(robot.full_theta, poses, robot.columns)
-    return T, tf.transport_covariance(J, robot.covariance)

@@ -59,7 +59,7 @@ def estimate_noise(
     rows = np.flatnonzero(robot.used)
     inside = poses.subset(rows)
     stack = Stack([o.subset(rows) for o in observations], len(rows))
-    state = State(robot.full_theta, robot.kernel.world_T_base, robot.kernel.flange_T_tool)
+    state = State(robot.kernel.theta0, robot.kernel.world_T_base, robot.kernel.flange_T_tool)
     evaluator = Evaluator(robot.kernel, inside, stack)
     at = evaluator(state)
     white = whitening(evaluator, state)

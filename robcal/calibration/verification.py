@@ -14,8 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
 from robcal import transforms as tf
+from robcal.calibration.calibrated import CalibratedRobot
 from robcal.calibration.identifiability import repetitions
-from robcal.calibration.identification import IdentifiedRobot, IdentifyOptions, identify, predict_frames
+from robcal.calibration.identification import IdentifiedRobot, IdentifyOptions, identify
 from robcal.calibration.observations import (
     DistanceObservations,
     FrameObservations,
@@ -24,7 +25,6 @@ from robcal.calibration.observations import (
     SensorPointObservations,
     Stack,
 )
-from robcal.calibration.problem import State, joint_scatter
 from robcal.errors import InvalidInput, NotIdentifiable
 from robcal.robot.kernel import Kernel, PoseInputs
 from robcal.robot.model import RobotModel
@@ -142,10 +142,10 @@ def tool_errors(T: Array, observations: Sequence[Observations]) -> dict[str, tup
 
 
 def verify(
-    robot: IdentifiedRobot,
+    robot: CalibratedRobot,
     poses: PoseInputs,
     observations: Sequence[Observations],
-    nominal: IdentifiedRobot | None = None,
+    nominal: CalibratedRobot | None = None,
 ) -> Verification:
     """Compare a calibrated robot with measurements at other poses.
 
@@ -155,10 +155,10 @@ def verify(
     poses, observations : the kept-out poses (n) and what was measured there.
     nominal : from :func:`fit_nominal` on the identification poses.
     """
-    T, C_T = predict_frames(robot, poses)
+    T, C_T = robot.predict(poses)
     square, degrees = _normalised(robot, poses, observations, T, C_T)
     errors = tool_errors(T, observations)
-    nominal_errors = None if nominal is None else tool_errors(predict_frames(nominal, poses)[0], observations)
+    nominal_errors = None if nominal is None else tool_errors(nominal.predict(poses)[0], observations)
     return _verification(
         "verify-set", poses, errors, nominal_errors, square, degrees, C_T, T, observations, np.arange(len(poses))
     )
@@ -201,11 +201,9 @@ def cross_validate(
         robot = identify(model, here, train, chosen, kernel)
         nominal = fit_nominal(model, here, train, chosen)
         there = poses.subset(out)
-        T, C_T = predict_frames(robot, there)
+        T, C_T = robot.predict(there)
         square, degrees = _normalised(robot, there, test, T, C_T)
-        parts.append(
-            (out, T, C_T, square, degrees, tool_errors(T, test), tool_errors(predict_frames(nominal, there)[0], test))
-        )
+        parts.append((out, T, C_T, square, degrees, tool_errors(T, test), tool_errors(nominal.predict(there)[0], test)))
     rows = np.concatenate([p[0] for p in parts])
     merged = [
         {
@@ -226,17 +224,13 @@ def cross_validate(
 
 
 def _normalised(
-    robot: IdentifiedRobot, poses: PoseInputs, observations: Sequence[Observations], T: Array, C_T: Array
+    robot: CalibratedRobot, poses: PoseInputs, observations: Sequence[Observations], T: Array, C_T: Array
 ) -> tuple[Array, NDArray[np.int64]]:
     """Squared normalised errors (n,) of the poses, per degree of freedom, and the degrees."""
     stack = Stack(observations, len(poses))
     stacked = stack.evaluate(T)
     C = stack.covariance(T) * np.where(stack.used[:, :, None] & stack.used[:, None, :], robot.covariance_scale, 1.0)
-    twist = C_T
-    if robot.options.joint_sigma is not None:
-        state = State(robot.full_theta, robot.kernel.world_T_base, robot.kernel.flange_T_tool)
-        twist = twist + robot.covariance_scale * joint_scatter(robot.kernel, state, poses, robot.options.joint_sigma)
-    C = C + tf.transport_covariance(stacked.B, twist)
+    C = C + tf.transport_covariance(stacked.B, C_T)
     white = np.linalg.solve(np.linalg.cholesky(C), stacked.r[..., None])[..., 0]
     degrees = stack.used.sum(axis=1)
     return np.sum(white**2, axis=1) / np.maximum(degrees, 1), degrees

@@ -19,6 +19,7 @@ from robcal.robot.model import Frame
 from robcal.transforms import Array, frame, frame_from_xyzrpy, rotation_from_rpy, rpy_from_rotation
 
 _NEGLIGIBLE = 1e-15
+_NEAR, _FAR = 2.0, 20.0
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,8 @@ def frames_from_dh(
 
     Raises
     ------
-    InvalidInput : no rows, numbers that are not finite, an unknown convention, or angles that look like degrees.
+    InvalidInput : no rows, numbers that are not finite, an unknown convention, angles that look like degrees, or links
+        that look like millimetres (offsets of nearly parallel axes that cancel are none).
     """
     if not rows:
         raise InvalidInput("the Denavit-Hartenberg table has no rows")
@@ -79,7 +81,11 @@ def frames_from_dh(
     for number, (row, link) in enumerate(zip(rows, links, strict=True), start=1):
         # Rz(theta + q) Trans(0, 0, d) link = [Rz(theta + q) R_link] Trans(R_link' ((0, 0, d) + t_link))
         roll, pitch, yaw = rpy_from_rotation(link[:3, :3])
-        along = np.array([0.0, 0.0, row.d])
+        # tables of nearly parallel axes (UR's factory calibration) hold offsets of hundreds of metres that cancel; the
+        # origin may stand anywhere on the joint's line, so it stays near the robot
+        shift = carry[2] if abs(carry[2]) > _NEAR and not row.prismatic else 0.0
+        carry = carry - [0.0, 0.0, shift]
+        along = np.array([0.0, 0.0, row.d + shift])
         xyz = carry + along if row.prismatic else carry
         behind = link[:3, 3] if row.prismatic else along + link[:3, 3]
         rpy = (float(roll), float(pitch), float(row.theta + yaw))
@@ -87,6 +93,9 @@ def frames_from_dh(
         frames.append(Frame(name, "z", row.prismatic, row.sign, row.limits, _triple(xyz), rpy))
         carry = link[:3, :3].T @ behind
     end = frame(np.eye(3), carry) @ (np.eye(4) if flange is None else np.asarray(flange, dtype=float))
+    places = np.array([*(f.xyz for f in frames), end[:3, 3]])
+    if np.max(np.abs(places)) > _FAR:
+        raise InvalidInput(f"Denavit-Hartenberg: a link is longer than {_FAR:g} m; are the lengths in millimetres?")
     frames.append(Frame("flange", None, xyz=_triple(end[:3, 3]), rpy=_triple(rpy_from_rotation(end[:3, :3]))))
     return tuple(frames)
 
@@ -110,8 +119,6 @@ def _check(row: DHRow, number: int) -> None:
         raise InvalidInput(f"Denavit-Hartenberg row {number}: a number is not finite")
     if max(abs(row.theta), abs(row.alpha), abs(row.beta)) > 4.0 * math.pi:
         raise InvalidInput(f"Denavit-Hartenberg row {number}: an angle exceeds two turns; are the angles in degrees?")
-    if max(abs(row.a), abs(row.d)) > 100.0:
-        raise InvalidInput(f"Denavit-Hartenberg row {number}: a length exceeds 100 m; are the lengths in millimetres?")
 
 
 def _triple(values: Array) -> tuple[float, float, float]:

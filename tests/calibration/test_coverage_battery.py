@@ -17,7 +17,7 @@ def test_95_percent_intervals_cover_93_to_97_percent() -> None:
     s = scenario(1)
     start = identify(s.model, s.poses, [s.frames(s.poses)], IdentifyOptions(robust=False), s.kernel)
     options = IdentifyOptions(parameters=start.names, robust=False, covariance="stated")
-    exact = start.kernel.frames(start.full_theta, s.poses)
+    exact = start.kernel.frames(start.kernel.theta0, s.poses)
     inside: dict[str, list[bool]] = {}
     for run in range(2000):
         noise = np.random.default_rng(run).normal(size=(len(exact), 6)) * np.repeat([5e-5, 1e-4], 3)
@@ -27,7 +27,7 @@ def test_95_percent_intervals_cover_93_to_97_percent() -> None:
         F = tf.difference(robot.kernel.flange_T_tool, start.kernel.flange_T_tool)
         ends = {f"{end}.{k}": v[i] for end, v in (("base", W), ("tool", F)) for i, k in enumerate(GEOMETRIC_KINDS)}
         for k, name in enumerate(robot.names):
-            miss = ends.get(name, start.full_theta[s.kernel.index[name]] - robot.theta[k])
+            miss = ends.get(name, start.kernel.theta0[s.kernel.index[name]] - robot.theta[k])
             kind = name.rsplit(".", 1)[-1]
             group = name.split(".")[0] if name in ends else "length" if kind in "xyz" else kind.split("_")[0]
             inside.setdefault(group, []).append(bool(abs(miss) < 1.959964 * robot.sigma[k]))

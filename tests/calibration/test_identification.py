@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from robcal import transforms as tf
-from robcal.calibration.identification import IdentifyOptions, identify, predict_frames
+from robcal.calibration.identification import IdentifyOptions, identify
 from robcal.calibration.observations import (
     DistanceObservations,
     FrameObservations,
@@ -35,7 +35,7 @@ def test_exact_data_are_reproduced_to_rounding() -> None:
     robot = identify(s.model, s.poses, [exact], kernel=s.kernel)
     assert robot.summary.converged
     # parameters left at nominal (parallel axes) cost less than a tenth of the stated noise
-    assert tool_miss(predict_frames(robot, s.kept_out)[0], s.truth.frames(s.theta, s.kept_out)) < 5e-6
+    assert tool_miss(robot.predict(s.kept_out)[0], s.truth.frames(s.theta, s.kept_out)) < 5e-6
 
 
 @pytest.mark.parametrize("compliant", [False, True])
@@ -48,7 +48,7 @@ def test_as_good_as_an_oracle_that_knows_the_form(compliant: bool) -> None:
         form = [n for n in s.kernel.names if s.theta[s.kernel.index[n]] != 0]
         for options, out in ((IdentifyOptions(), ours), (IdentifyOptions(parameters=form), oracle)):
             robot = identify(s.model, s.poses, [observed], options, s.kernel)
-            out.append(tool_miss(predict_frames(robot, s.kept_out)[0], truth))
+            out.append(tool_miss(robot.predict(s.kept_out)[0], truth))
             assert robot.summary.converged
     assert np.mean(ours) < 1.08 * np.mean(oracle)
     assert np.mean(ours) < 3.5e-5
@@ -60,7 +60,7 @@ def test_statistics_are_honest() -> None:
     for seed in range(6):
         s = scenario(seed, n=50)
         robot = identify(s.model, s.poses, [s.frames(s.poses)], IdentifyOptions(parameters="standard"), s.kernel)
-        T, C = predict_frames(robot, s.kept_out)
+        T, C = robot.predict(s.kept_out)
         delta = tf.difference(T, s.truth.frames(s.theta, s.kept_out))
         z = np.einsum("ni,nij,nj->n", delta[:, :3], np.linalg.inv(C[:, :3, :3]), delta[:, :3])
         inside += int(np.sum(z < 7.815))
@@ -89,7 +89,7 @@ def test_a_point_alone_leaves_the_tools_turn_open_and_agrees_with_frames() -> No
     s = scenario(2)
     robots = [identify(s.model, s.poses, o, kernel=s.kernel) for o in ([_points(s)], [s.frames(s.poses)])]
     assert robots[0].eliminated["tool.roll"].reason == "no influence"
-    frames = [predict_frames(r, s.kept_out) for r in robots]
+    frames = [r.predict(s.kept_out) for r in robots]
     d = frames[0][0][:, :3, 3] - frames[1][0][:, :3, 3]
     R = [f[0][:, :3, :3] for f in frames]
     C = sum(tf.transport_covariance(R[k], frames[k][1][:, :3, :3]) for k in (0, 1))
@@ -113,7 +113,7 @@ def test_mixtures_of_frames_points_distances_and_sensor() -> None:
     )
     robot = identify(s.model, s.poses, parts, kernel=s.kernel)
     assert 0.85 < robot.sigma0 < 1.15
-    assert tool_miss(predict_frames(robot, s.kept_out)[0], s.truth.frames(s.theta, s.kept_out)) < 8e-5
+    assert tool_miss(robot.predict(s.kept_out)[0], s.truth.frames(s.theta, s.kept_out)) < 8e-5
 
 
 def test_distances_alone() -> None:
@@ -129,7 +129,7 @@ def test_distances_alone() -> None:
     )
     assert robot.summary.converged
     assert 0.9 < robot.sigma0 < 1.1
-    predicted = np.linalg.norm(predict_frames(robot, s.kept_out)[0][:, :3, 3], axis=1)
+    predicted = np.linalg.norm(robot.predict(s.kept_out)[0][:, :3, 3], axis=1)
     truth = np.linalg.norm(s.truth.frames(s.theta, s.kept_out)[:, :3, 3], axis=1)
     assert np.abs(predicted - truth).mean() < 5e-5
 
@@ -158,7 +158,7 @@ def test_basis_norm_table_5_4_and_named_parameters() -> None:
         IdentifyOptions(statics="converged"),
     ):
         robot = identify(s.model, s.poses, [observed], options)
-        assert tool_miss(predict_frames(robot, s.kept_out)[0], truth) < 5e-4, options
+        assert tool_miss(robot.predict(s.kept_out)[0], truth) < 5e-4, options
     robot = identify(s.model, s.poses, [observed], IdentifyOptions(parameters=["axis2.pitch"]), s.kernel)
     assert set(robot.names) - {"axis2.pitch"} == {
         f"{e}.{k}" for e in ("base", "tool") for k in ("x", "y", "z", "roll", "pitch", "yaw")
@@ -213,5 +213,5 @@ def test_result_can_be_evaluated_again_from_its_model() -> None:
     s = scenario(10)
     robot = identify(s.model, s.poses, [s.frames(s.poses)], kernel=s.kernel)
     again = Kernel(robot.model)
-    np.testing.assert_allclose(again.frames(again.theta0, s.kept_out), predict_frames(robot, s.kept_out)[0], atol=1e-12)
+    np.testing.assert_allclose(again.frames(again.theta0, s.kept_out), robot.predict(s.kept_out)[0], atol=1e-12)
     assert s.kernel.model.parameters == {}

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from robcal.calibration.collision import HalfSpace, link_capsules, obstacle_clearance, place_capsules
-from robcal.calibration.identification import IdentifyOptions, identify, predict_frames
+from robcal.calibration.identification import IdentifyOptions, identify
 from robcal.calibration.observations import FrameObservations
 from robcal.calibration.pose_candidates import Cell, check_poses, find_candidates
 from robcal.calibration.pose_choice import (
@@ -259,7 +259,7 @@ def test_predicted_accuracy_is_what_an_identification_reaches():
         noise = rng.normal(size=(len(T), 6)) * np.repeat(request.sigma, 3)
         measured = FrameObservations.isotropic(retract(T, noise), *request.sigma)
         found = identify(MODEL, kernel.poses(plan.q), [measured], IdentifyOptions(parameters="geometry"))
-        predicted, _ = predict_frames(found, found.kernel.poses(elsewhere))
+        predicted, _ = found.predict(found.kernel.poses(elsewhere))
         truth = kernel.frames(kernel.theta0, kernel.poses(elsewhere))
         squares += [np.sum((transform(predicted, p) - transform(truth, p)) ** 2, axis=1) for p in points]
     reached = np.sqrt(np.mean(squares))

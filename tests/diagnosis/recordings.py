@@ -9,14 +9,14 @@ import numpy as np
 
 from fixtures.campaigns import make_campaign
 from pipeline.bodies import body_for_robot
-from pipeline.calibrated import recorded_inputs
 from pipeline.campaign import read_campaign
 from pipeline.runs import Run
-from pipeline.stages.diagnose import recording_for_diagnosis
-from pipeline.stages.identify import identify_recording, options_of, require_robot
+from pipeline.stages.identify import options_of, require_robot
 from pipeline.stages.observations import build_recording
 from robcal.calibration.identification import IdentifiedRobot
+from robcal.calibration.variance_components import identify_recording
 from robcal.diagnosis.core.recording import Recording
+from robcal.recipe.recording import recording_for_diagnosis
 from robcal.robot.kernel import Kernel
 
 
@@ -30,7 +30,7 @@ def concealed(folder: Path, **plan: Any) -> tuple[IdentifiedRobot, Recording, Re
     rows = np.flatnonzero(~poses.verify)
     kernel = Kernel(robot, campaign.entry.model.statics)
     options = options_of(campaign, measured.stated)
-    found, measured = identify_recording(robot, recorded_inputs(kernel, poses), measured, rows, options, kernel)
+    found, measured = identify_recording(robot, poses.inputs(kernel), measured, rows, options, kernel)
     identify = recording_for_diagnosis(poses, measured, rows, body)
     verify = recording_for_diagnosis(poses, measured, np.flatnonzero(poses.verify), body)
     assert identify is not None

@@ -10,13 +10,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from pipeline.stages.diagnose import own_elasticities
 from robcal.calibration.observations import PointObservations
 from robcal.diagnosis.content import as_contract
 from robcal.diagnosis.core.fitting import Accepted
 from robcal.diagnosis.core.result import Diagnosis
 from robcal.diagnosis.diagnose import diagnose, told_through
 from robcal.physics.cause import Family
+from robcal.recipe.robot_diagnosis import own_elasticities
 from robcal.transforms import exp_so3
 from tests.diagnosis.recordings import concealed
 

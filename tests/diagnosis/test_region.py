@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.stages.diagnose import optional_parameters, own_elasticities
 from robcal.diagnosis.core.fitting import fit
 from robcal.diagnosis.diagnose import diagnose
 from robcal.diagnosis.gain.region import SHARE, extrapolated, outermost, region_errors
+from robcal.recipe.robot_diagnosis import optional_parameters, own_elasticities
 from tests.diagnosis.recordings import concealed
 
 

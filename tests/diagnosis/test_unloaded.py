@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.stages.diagnose import optional_parameters, own_elasticities
 from robcal.calibration.identification import IdentifiedRobot
 from robcal.diagnosis.core.recording import Recording
 from robcal.diagnosis.core.result import Diagnosis
 from robcal.diagnosis.diagnose import diagnose
 from robcal.diagnosis.search.unloaded import unloaded_elasticities
+from robcal.recipe.robot_diagnosis import optional_parameters, own_elasticities
 from tests.diagnosis.recordings import concealed
 
 

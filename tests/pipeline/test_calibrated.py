@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.calibrated import Calibrated, predicted, with_folded_cell
-from pipeline.poses_table import Poses
 from pipeline.robot_file import read_robot
+from robcal.calibration.calibrated import CalibratedRobot, with_folded_cell
+from robcal.calibration.joint_log import JointLog
 from robcal.robot.kernel import Kernel
 from robcal.transforms import frame_from_xyzrpy
 
@@ -36,15 +36,11 @@ def test_folding_the_cell_moves_nothing() -> None:
 def test_joint_scatter_is_part_of_what_a_prediction_may_miss() -> None:
     model = replace(read_robot(UR10), world_T_base=np.eye(4), flange_T_tool=np.eye(4))
     q = np.random.default_rng(3).uniform(-1, 1, (4, 6))
-    poses = Poses(
-        Path("poses.csv"), ("a", "b", "c", "d"), np.arange(4), q, (None,) * 4, np.zeros(4, dtype=bool), np.zeros((4, 6))
-    )
+    poses = JointLog(("a", "b", "c", "d"), q, (None,) * 4, np.zeros(4, dtype=bool), np.zeros((4, 6)))
     kernel = Kernel(model)
-    calibrated = Calibrated(model, model, "one_step", (), np.zeros((0, 0)), q, np.tile(np.eye(4), (4, 1, 1)))
-    T, without = predicted(calibrated, poses)
-    _, covariance = predicted(replace(calibrated, joint_sigma=1e-4), poses)
-    assert without is not None
-    assert covariance is not None
+    calibrated = CalibratedRobot(model=model)
+    T, without = calibrated.predict(calibrated.inputs(poses))
+    _, covariance = replace(calibrated, joint_sigma=1e-4).predict(calibrated.inputs(poses))
     assert not without.any()
     rng = np.random.default_rng(4)
     samples = [kernel.frames(kernel.theta0, kernel.poses(q + 1e-4 * rng.normal(size=q.shape))) for _ in range(4000)]

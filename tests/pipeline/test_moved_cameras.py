@@ -13,16 +13,16 @@ from fixtures.own_effects import draw_own_effect
 from fixtures.own_files import make_own
 from fixtures.own_station import OwnPlan, kept_out_frames
 from fixtures.signature import tip_error_mm
-from pipeline.calibrated import load_calibrated, predicted
-from pipeline.common_errors import common_errors
 from pipeline.poses_table import read_poses
 from pipeline.runner import run_campaign
 from pipeline.runs import Run
-from pipeline.stages.diagnose import settings_beside
-from pipeline.stages.identify import load_identification
+from pipeline.stages.identify import load_calibrated, load_identification
+from robcal.calibration.calibrated import CalibratedRobot
 from robcal.diagnosis.images.camera_moves import epochs_of
 from robcal.diagnosis.images.diagnosis import ImageFinding
 from robcal.diagnosis.search.selection import SelectionSettings
+from robcal.recipe.recording import common_errors
+from robcal.recipe.robot_diagnosis import settings_beside
 
 PLAN = {"seed": 21, "robot": "ur10", "poses": 50, "verify": 10, "kept_out": 30}
 
@@ -57,12 +57,12 @@ def test_healthy_station_gets_no_epoch_and_a_better_robot_than_from_frames_alone
     assert not any(poses for poses in epochs_of(station).values())
     assert not json.loads(run.diagnosis.read_text())["mismatch"]
 
-    def error(calibrated: object) -> float:
+    def error(calibrated: CalibratedRobot) -> float:
         table = tmp_path / "campaign" / "kept_out.csv"
-        poses = read_poses(table, calibrated.model, calibrated.model.payloads, to_predict=True)  # type: ignore[attr-defined]
-        return tip_error_mm(predicted(calibrated, poses)[0], kept_out_frames(truth))  # type: ignore[arg-type]
+        poses = read_poses(table, calibrated.model, calibrated.model.payloads, to_predict=True)
+        return tip_error_mm(calibrated.predict(calibrated.inputs(poses))[0], kept_out_frames(truth))
 
-    assert error(load_calibrated(run)) < 0.6 * error(run.load("calibrated_identify"))
+    assert error(load_calibrated(run)) < 0.6 * error(load_identification(run).robot)
     recording = load_identification(run).recording
     rows = recording.poses
     (frames,) = recording.select(rows, detailed=True)

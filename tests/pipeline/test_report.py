@@ -20,7 +20,7 @@ from pipeline.report.diagnosis_chapter import _gain
 from pipeline.report.style import label, number, probability
 from pipeline.runner import run_campaign
 from pipeline.runs import Run, open_run
-from pipeline.stages.evidence import Evidence
+from robcal.recipe.evidence import Evidence
 from tests.pipeline.conftest import Rows, edit_rows, edit_yaml
 
 HOSTILE = "<script>alert(1)<img src=x onerror=alert(1)>"  # names of campaigns have no slash

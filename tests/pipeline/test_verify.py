@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from pipeline.stages.observations import RobotRecording
-from pipeline.stages.verify import well_measured
+from robcal.calibration.measurements import RobotRecording, well_measured
 from robcal.calibration.observations import FrameObservations
 
 NAMES = [f"p{i}" for i in range(20)]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -65,3 +67,24 @@ def test_ur10_table_reaches_the_published_zero_position():
 def test_bad_tables_are_refused(table, words):
     with pytest.raises(InvalidInput, match=words):
         frames_from_dh(table)
+
+
+def test_factory_tables_with_offsets_that_cancel_are_read_and_kept_near_the_robot():
+    """UR's own calibration: axes 2 and 3 nearly parallel, d of hundreds of metres."""
+    columns = {
+        "theta": (-1e-5, -1.437, 2.0254, -0.5883, 4e-5, 8e-6),
+        "a": (0.00028, -0.0567, -0.3265, 0.0, 0.0, 0.0),
+        "d": (0.0889, 574.24, -507.36, -66.77, 0.09497, 0.08256),
+        "alpha": (1.57034, -0.000734, 0.003256, 1.5704, -1.57101, 0.0),
+    }
+    table = [DHRow(**dict(zip(columns, row, strict=True))) for row in zip(*columns.values(), strict=True)]
+    q = np.random.default_rng(2).uniform(-3, 3, 6)
+    frames = frames_from_dh(table)
+    expected = np.eye(4)
+    for row, value in zip(table, q, strict=True):
+        expected = expected @ dh_matrix(row, value)
+    assert forward(chain_of(RobotModel("ur5", frames)), q)[0] == pytest.approx(expected, abs=1e-10)
+    assert max(np.linalg.norm(f.xyz) for f in frames) < 1.0
+    in_millimetres = [replace(row, d=1e3 * row.d, a=1e3 * row.a) for row in table]
+    with pytest.raises(InvalidInput, match="millimetres"):
+        frames_from_dh(in_millimetres)

@@ -29,7 +29,7 @@ Misfit = Callable[[StationOrientation], tuple[float, int] | None]
 
 
 def with_small_moves(
-    orient: Orient, data: Callable[[StationOrientation], ImageData]
+    orientation: StationOrientation, orient: Orient, data: Callable[[StationOrientation], ImageData]
 ) -> tuple[StationOrientation, Orient]:
     """The station with an epoch for each camera movement that the diagnosis of the images finds.
 
@@ -38,9 +38,9 @@ def with_small_moves(
 
     Parameters
     ----------
-    orient : orientation with given settings. data : the diagnosis' view of an orientation.
+    orientation : with the default settings. orient : orientation with given settings.
+    data : the diagnosis' view of an orientation.
     """
-    orientation = orient(StationSettings())
     if len(orientation.names) < 2:
         return orientation, orient
     moved = [e for e in orientation.evidence if e.kind == "camera_moved"]

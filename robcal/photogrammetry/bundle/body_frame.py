@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import Enum
 
 import numpy as np
 
@@ -11,13 +12,27 @@ from robcal.photogrammetry.core.network import IntArray
 from robcal.transforms import Array, fit_frame, invert, transform
 
 
+class FrameOrigin(Enum):
+    """What defines a frame (or, of scale bars, its scale alone)."""
+
+    GIVEN_COORDINATES = "fitted onto the given coordinates"
+    PRINCIPAL_AXES = "origin in the centroid, axes along the principal directions"
+    SCALE_BARS = "scale bars"
+
+
 @dataclass(frozen=True)
 class Similarity:
-    """``p_new = scale * new_T_old p_old`` with words on where it comes from."""
+    """``p_new = scale * new_T_old p_old``; ``targets``: how many were fitted."""
 
     scale: float
     new_T_old: Array
-    words: str
+    origin: FrameOrigin
+    targets: int = 0
+
+    @property
+    def description(self) -> str:
+        """What defines the frame, for the report."""
+        return f"{self.origin.value} of {self.targets} targets" if self.targets else self.origin.value
 
     def points(self, p_old: Array) -> Array:
         """Points in the new frame."""
@@ -46,10 +61,10 @@ def fit_similarity(p_new: Array, p_old: Array, *, with_scale: bool, rounds: int 
         scale = float(np.sum(w[:, None] * a * b) / np.sum(w[:, None] * b * b)) if with_scale else 1.0
         T = T.copy()
         T[:3, 3] = share @ p_new - scale * T[:3, :3] @ (share @ p_old)
-        miss = np.linalg.norm(p_new - transform(T, scale * p_old), axis=1)
-        limit = max(2.0 * float(np.median(miss)), 1e-12)
-        w = np.where(miss > limit, limit / np.maximum(miss, 1e-300), 1.0)
-    return Similarity(scale, T, f"fitted onto the given coordinates of {len(p_new)} targets")
+        residual = np.linalg.norm(p_new - transform(T, scale * p_old), axis=1)
+        limit = max(2.0 * float(np.median(residual)), 1e-12)
+        w = np.where(residual > limit, limit / np.maximum(residual, 1e-300), 1.0)
+    return Similarity(scale, T, FrameOrigin.GIVEN_COORDINATES, len(p_new))
 
 
 def principal_frame(points: Array, station_centres: Array, ids: IntArray) -> Similarity:
@@ -71,7 +86,7 @@ def principal_frame(points: Array, station_centres: Array, ids: IntArray) -> Sim
     T = np.eye(4)
     T[:3, :3] = R
     T[:3, 3] = -R @ centre
-    return Similarity(1.0, T, "origin in the centroid, axes along the principal directions")
+    return Similarity(1.0, T, FrameOrigin.PRINCIPAL_AXES)
 
 
 def body_frame(points: Array, ids: IntArray, given: Array, station_centres: Array, *, with_scale: bool) -> Similarity:
@@ -89,4 +104,4 @@ def body_frame(points: Array, ids: IntArray, given: Array, station_centres: Arra
         b = points[rows] - points[rows].mean(axis=0)
         scale = float(np.sqrt(np.sum(a**2) / np.sum(b**2)))
     base = principal_frame(scale * points, scale * station_centres, ids)
-    return Similarity(scale, base.new_T_old, base.words)
+    return Similarity(scale, base.new_T_old, base.origin)

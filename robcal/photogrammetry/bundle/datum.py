@@ -7,6 +7,7 @@ Source: inner constraints (free network) after Granshaw (1980), Photogrammetric 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from scipy import linalg
@@ -22,16 +23,16 @@ class Datum:
 
     Attributes
     ----------
-    kind : 'inner' or 'fixed'.
+    kind : 'inner' constraints, or coordinates held 'fixed'.
     rows : rows of the points that carry it.
     scale : true if the scale too is a freedom to be constrained.
-    words : for the report.
+    description : for the report.
     """
 
-    kind: str
+    kind: Literal["inner", "fixed"]
     rows: IntArray
     scale: bool
-    words: str
+    description: str
 
     @property
     def defect(self) -> int:
@@ -39,7 +40,7 @@ class Datum:
         return 0 if self.kind == "fixed" else 6 + int(self.scale)
 
     def null_space(self, points: Array) -> Array:
-        """(3t, defect) changes of the coordinates that no image notices: shift, turn about the centroid, scale."""
+        """(3t, defect) changes of the coordinates that no image can see: shift, turn about the centroid, scale."""
         centred = points - points[self.rows].mean(axis=0)
         reach = max(float(np.sqrt(np.mean(np.sum(centred**2, axis=1)))), 1e-12)
         unit = np.broadcast_to(np.eye(3), (len(points), 3, 3))
@@ -64,50 +65,50 @@ class Datum:
 
 @dataclass(frozen=True)
 class InnerOver:
-    """Wish for inner constraints over some targets only (those whose given coordinates define the frame)."""
+    """Specification of inner constraints over some targets only (those whose given coordinates define the frame)."""
 
     ids: tuple[int, ...]
 
 
-DatumWish = str | tuple[int, ...] | InnerOver
+DatumSpec = Literal["free", "bars"] | tuple[int, ...] | InnerOver
 
 
-def resolve_datum(wish: DatumWish, ids: IntArray, points: Array, lengths: Lengths) -> tuple[Datum, str]:
-    """The datum for a wish ('free', 'bars' or ids of fixed targets) and a note ('' if there is nothing to say).
+def resolve_datum(spec: DatumSpec, ids: IntArray, points: Array, lengths: Lengths) -> tuple[Datum, str]:
+    """The datum for a specification ('free', 'bars' or ids of fixed targets) and a note, '' if there is none.
 
     'bars': inner constraints over the end points of the scale bars; where these do not span a triangle (one bar), the
     free datum is taken instead and the note says so.
 
     Raises
     ------
-    InvalidInput : unknown word or ids.
+    InvalidInput : unknown specification or ids.
     DegenerateGeometry : fewer than three fixed targets, or in one line.
     """
     known = {int(v): i for i, v in enumerate(ids)}
     scale = len(lengths) == 0
     everything = np.arange(len(ids), dtype=np.int64)
-    if isinstance(wish, str):
-        if wish == "free":
+    if isinstance(spec, str):
+        if spec == "free":
             return Datum("inner", everything, scale, "free network (inner constraints over all targets)"), ""
-        if wish == "bars":
+        if spec == "bars":
             rows = np.array(sorted({known[int(v)] for v in lengths.ids.ravel() if int(v) in known}), dtype=np.int64)
             if spans_triangle(points[rows]):
                 return Datum("inner", rows, scale, "inner constraints over the targets of the scale bars"), ""
             note = "datum bars: the targets of the scale bars lie in one line, the free datum was taken instead"
             return Datum("inner", everything, scale, "free network (inner constraints over all targets)"), note
-        raise InvalidInput(f"datum {wish!r} is unknown: give free, bars or the ids of fixed targets")
-    if isinstance(wish, InnerOver):
-        rows = np.array([known[int(v)] for v in wish.ids if int(v) in known], dtype=np.int64)
+        raise InvalidInput(f"datum {spec!r} is unknown: give free, bars or the ids of fixed targets")
+    if isinstance(spec, InnerOver):
+        rows = np.array([known[int(v)] for v in spec.ids if int(v) in known], dtype=np.int64)
         if spans_triangle(points[rows]):
             return Datum("inner", rows, scale, f"inner constraints over {len(rows)} targets with given coordinates"), ""
         raise DegenerateGeometry("the targets that should define the frame do not span a triangle: name more of them")
-    missing = sorted(int(v) for v in wish if int(v) not in known)
+    missing = sorted(int(v) for v in spec if int(v) not in known)
     if missing:
         raise InvalidInput(f"targets {missing} of the fixed datum are not measured in two images: choose other targets")
-    rows = np.array([known[int(v)] for v in wish], dtype=np.int64)
+    rows = np.array([known[int(v)] for v in spec], dtype=np.int64)
     if not spans_triangle(points[rows]):
         raise DegenerateGeometry("a fixed datum needs three targets that span a triangle: name more of them")
-    return Datum("fixed", rows, False, f"targets {sorted(int(v) for v in wish)} held fixed"), ""
+    return Datum("fixed", rows, False, f"targets {sorted(int(v) for v in spec)} held fixed"), ""
 
 
 def spans_triangle(points: Array) -> bool:

@@ -30,14 +30,12 @@ _TRUNCATED = 9.0
 
 
 @dataclass(frozen=True)
-class StartNetwork:
-    """Approximate network: stations (n, 4, 4) and points (t, 3) with NaN where not reached; fit per mark (m,)."""
+class Approximate:
+    """Approximate values of a network: stations (n, 4, 4) and points (t, 3), NaN where there are none yet."""
 
     camera: Camera
     camera_T_body: Array
     points: Array
-    fits: NDArray[np.bool_]
-    cost: float
 
     @property
     def placed(self) -> NDArray[np.bool_]:
@@ -48,6 +46,14 @@ class StartNetwork:
     def located(self) -> NDArray[np.bool_]:
         """(t,) targets with coordinates."""
         return np.isfinite(self.points[:, 0])
+
+
+@dataclass(frozen=True)
+class StartNetwork(Approximate):
+    """Approximate network of identified marks: whether each mark (m,) fits, and the robust cost of all."""
+
+    fits: NDArray[np.bool_]
+    cost: float
 
 
 def approximate_network(

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from robcal.errors import DegenerateGeometry
+from robcal.estimation.grouping import sum_by
 from robcal.photogrammetry.core.bodies import Body, IntArray, line_ratio
 from robcal.photogrammetry.core.camera import project
 from robcal.photogrammetry.core.eccentric_circle import effective_point
-from robcal.photogrammetry.core.grouping import sum_by
 from robcal.photogrammetry.measure.measured_points import MeasuredPoints, RejectedPoint, ResectedPoses
 from robcal.photogrammetry.orientation.intersection import intersect
 from robcal.photogrammetry.orientation.resection import PoseFit, Resection, refine_poses, resect_images

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipeline.adjusted_images import findings_of
 from pipeline.campaign import read_campaign
-from pipeline.image_findings import images_of
 from pipeline.runs import Run
 from robcal.diagnosis.images.diagnosis import ImageFinding
 from robcal.diagnosis.images.lens_findings import beyond_lenses, station_findings, survey_findings
@@ -82,7 +82,7 @@ def test_recorded_sheet_radial_then_tangential(tmp_path):
     causes = [c["cause"] for c in told["causes"]]
     assert causes[:2] == ["lens_radial", "lens_tangential"]
     assert set(causes) <= {"lens_radial", "lens_tangential", "lens_affinity"}
-    assert images_of(read_campaign(REAL / "dbat_camcal"), Run(tmp_path)).findings[0].heldout_px[1] < 0.17
+    assert findings_of(read_campaign(REAL / "dbat_camcal"), Run(tmp_path)).findings[0].heldout_px[1] < 0.17
 
 
 @pytest.mark.skipif(not (REAL / "opencv_stereo_chess").is_dir(), reason="recorded data are not beside this checkout")

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.image_findings import light_of
 from robcal.diagnosis.images.data import ImageData
 from robcal.diagnosis.images.light_lag import without_lag
 from robcal.photogrammetry.station.seen_normals import Ellipses
+from robcal.recipe.station import light_of
 from tests.diagnosis.image_scenes import Station, station
 
 LAG = np.array([0.4, 0.0])

@@ -1,15 +1,43 @@
-"""Errors that all poses share, as the diagnosis takes them: orientation of the station, coordinates of the body."""
+"""A recording as the diagnosis takes it, with the errors that all poses share: of the station, of the body."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from pipeline.stages.observations import RobotObservations, RobotRecording, Rows
+from robcal.calibration.joint_log import JointLog
+from robcal.calibration.measurements import RobotObservations, RobotRecording, Rows
 from robcal.calibration.observations import FrameObservations, PointObservations
+from robcal.diagnosis.core.recording import Recording
 from robcal.photogrammetry.core.bodies import Body
 from robcal.photogrammetry.measure.measured_points import MeasuredPoints
 from robcal.photogrammetry.station.network import StationOrientation
 from robcal.transforms import Array
+
+
+def recording_for_diagnosis(
+    log: JointLog,
+    recording: RobotRecording,
+    rows: Rows,
+    body: Body | None,
+    points: MeasuredPoints | None = None,
+    orientation: StationOrientation | None = None,
+) -> Recording | None:
+    """The measurements of some poses in the form the diagnosis takes: the kind with the most of them."""
+    chosen = recording.select(rows, detailed=True)
+    if not chosen:
+        return None
+    observations = max(chosen, key=lambda o: len(o.pose) * o.dimension)
+    return Recording(
+        q=log.q[rows],
+        payload=tuple(log.payload[i] for i in rows),
+        covariates={name: values[rows] for name, values in log.recorded().items()},
+        names=tuple(log.names[i] for i in rows),
+        observations=observations,
+        body=body.name if body is not None else "body",
+        ids=tuple(int(i) for i in body.ids) if body is not None else (),
+        common=common_errors(observations, recording, rows, body, points, orientation),
+        own_station=orientation is not None and isinstance(observations, FrameObservations),
+    )
 
 
 def common_errors(

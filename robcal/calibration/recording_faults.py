@@ -6,16 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.bodies import body_for_robot
-from pipeline.calibrated import recorded_inputs
-from pipeline.campaign import Campaign
-from pipeline.poses_table import Poses
-from pipeline.runs import Run
-from pipeline.stages.observations import RobotRecording, build_recording
 from robcal.calibration.identification import IdentifiedRobot
+from robcal.calibration.measurements import RobotRecording
 from robcal.calibration.observations import DistanceObservations, FrameObservations, PointObservations
 from robcal.calibration.plausibility import SUSPICIOUS_SHARE, likely_causes
-from robcal.errors import InvalidInput, RobcalError
+from robcal.errors import InvalidInput
 from robcal.robot.kernel import Kernel, PoseInputs
 from robcal.robot.model import RobotModel
 
@@ -35,28 +30,21 @@ _REMEDIES = {
 }
 
 
-def check_joint_log(
-    robot: RobotModel, poses: Poses, inputs: PoseInputs, recording: RobotRecording, kernel: Kernel
-) -> None:
+def check_joint_log(robot: RobotModel, inputs: PoseInputs, recording: RobotRecording, kernel: Kernel) -> None:
     """Refuse recordings in which joint angles and measurements do not belong together.
 
     Raises
     ------
     InvalidInput : a fault that explains the miss was found; the message gives the proof and the remedy.
     """
-    _check_unit(poses, inputs, recording, kernel)
-    fault = _fault(robot, inputs, recording, kernel)
+    _check_unit(inputs, recording, kernel)
+    fault = fault_of(robot, inputs, recording, kernel)
     if fault:
-        raise InvalidInput(f"{poses.path}: joint angles and measurements do not belong together: {fault}")
+        raise InvalidInput(f"joint angles and measurements do not belong together: {fault}")
 
 
 def check_failed_fit(
-    robot: RobotModel,
-    poses: Poses,
-    inputs: PoseInputs,
-    recording: RobotRecording,
-    kernel: Kernel,
-    found: IdentifiedRobot,
+    robot: RobotModel, inputs: PoseInputs, recording: RobotRecording, kernel: Kernel, found: IdentifiedRobot
 ) -> None:
     """Where even the identified robot misses by many sigmas, look for smaller slips (a sign of the last joint, say).
 
@@ -69,42 +57,21 @@ def check_failed_fit(
         return
     rows = np.arange(min(len(inputs), MOST_POSES))
     few = replace(recording, observations=recording.select(rows))
-    fault = _fault(robot, inputs.subset(rows), few, kernel, share=0.0)
+    fault = fault_of(robot, inputs.subset(rows), few, kernel, share=0.0)
     if fault:
-        raise InvalidInput(f"{poses.path}: joint angles and measurements do not belong together: {fault}")
-    T = found.kernel.frames(found.full_theta, inputs)
+        raise InvalidInput(f"joint angles and measurements do not belong together: {fault}")
+    T = found.kernel.frames(found.kernel.theta0, inputs)
     miss = float(np.sqrt(np.mean(np.concatenate([o.evaluate(T)[0].ravel() ** 2 for o in recording.observations]))))
     size = float(np.linalg.norm(np.std(T[:, :3, 3], axis=0)))
     if miss > max(HOPELESS, HOPELESS_SHARE * size):
         raise InvalidInput(
-            f"{poses.path}: even the identified robot misses the measurements by {1e3 * miss:.3g} mm RMS: joint "
+            f"even the identified robot misses the measurements by {1e3 * miss:.3g} mm RMS: joint "
             "angles, robot file and measurements do not belong together, and no single slip (sign, unit, exchanged "
             "columns, shifted rows) explains it: check which recording belongs to which"
         )
 
 
-def check_joint_limits(campaign: Campaign, run: Run) -> None:
-    """Refuse poses beyond the robot's ranges; where a slip in the recording explains them, name it with the proof.
-
-    Raises
-    ------
-    InvalidInput : some pose is beyond a range of the robot file.
-    """
-    poses, robot = campaign.poses, campaign.robot
-    if poses is None or robot is None or not poses.outside:
-        return
-    fault = ""
-    if campaign.measurements:
-        kernel = Kernel(robot, campaign.entry.model.statics)
-        try:
-            recording = build_recording(campaign, run, body_for_robot(campaign, run))
-            fault = _fault(robot, recorded_inputs(kernel, poses), recording, kernel)
-        except RobcalError:
-            fault = ""  # what else is wrong comes to light once the angles are within the ranges
-    raise InvalidInput(poses.outside + (f"; a likely cause: {fault}" if fault else ""))
-
-
-def _fault(
+def fault_of(
     robot: RobotModel, inputs: PoseInputs, recording: RobotRecording, kernel: Kernel, share: float = SUSPICIOUS_SHARE
 ) -> str:
     """The likeliest slip with proof and remedy; empty if there is none."""
@@ -114,7 +81,7 @@ def _fault(
     return f"{found[0].statement}: {_REMEDIES.get(found[0].kind, 'correct the recording')}"
 
 
-def _check_unit(poses: Poses, inputs: PoseInputs, recording: RobotRecording, kernel: Kernel) -> None:
+def _check_unit(inputs: PoseInputs, recording: RobotRecording, kernel: Kernel) -> None:
     """Coordinates in metres under a heading of millimetres: the measured ways are a thousandth of the robot's."""
     moved = kernel.with_references(np.eye(4), np.eye(4)).frames(kernel.theta0, inputs)[:, :3, 3]
     for o in recording.observations:
@@ -129,6 +96,6 @@ def _check_unit(poses: Poses, inputs: PoseInputs, recording: RobotRecording, ker
         way, robot_way = float(np.std(measured, axis=0).max()), float(np.std(moved[o.pose], axis=0).max())
         if robot_way > 1e-3 and (way > 100 * robot_way or way < 0.01 * robot_way):
             raise InvalidInput(
-                f"{poses.path.parent}: the measured coordinates scatter by {way * 1000:.3g} mm while the robot moved "
+                f"the measured coordinates scatter by {way * 1000:.3g} mm while the robot moved "
                 f"by {robot_way * 1000:.3g} mm: columns _mm must be in millimetres, check the unit of the measurements"
             )

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
 
 import numpy as np
 
-from pipeline.poses_table import Poses
-from pipeline.stages.observations import RobotObservations, RobotRecording
+from robcal.calibration.joint_log import JointLog
+from robcal.calibration.measurements import RobotObservations, RobotRecording
 from robcal.calibration.observations import DistanceObservations, FrameObservations
 from robcal.diagnosis.core.recording import Recording, observation_data
 from robcal.diagnosis.core.result import Diagnosis
@@ -20,7 +19,7 @@ MEASURING = ("camera", "wire", "sensor")
 
 
 def corrected(
-    recording: RobotRecording, poses: Poses, diagnosis: Diagnosis, shared: Array | None = None
+    recording: RobotRecording, log: JointLog, diagnosis: Diagnosis, shared: Array | None = None
 ) -> RobotRecording | None:
     """The recording without the displacements found in the measuring system; None where there are none.
 
@@ -44,7 +43,7 @@ def corrected(
         return displaced(o) if found else o
 
     def displaced(o: RobotObservations) -> RobotObservations:
-        rows = Recording(poses.q, poses.payload, _covariates(poses), poses.names, o)
+        rows = Recording(log.q, log.payload, log.recorded(), log.names, o)
         inputs = rows.inputs(kernel)
         data = observation_data(rows, kernel.frames(kernel.theta0, inputs), kernel.variables(kernel.theta0, inputs))
         shift = sum((f.family.displace(data, f.constants) @ f.values for f in found if f.family.displace), np.zeros(()))
@@ -56,9 +55,3 @@ def corrected(
 
     observations, detailed = (tuple(free(o) for o in some) for some in (recording.observations, recording.detailed))
     return dataclasses.replace(recording, observations=observations, detailed=detailed)
-
-
-def _covariates(poses: Poses) -> Mapping[str, Array]:
-    columns = {name: np.asarray(values, dtype=float) for name, values in poses.covariates.items()}
-    columns.update({f"approach{k + 1}": poses.approach[:, k] for k in range(poses.q.shape[1])})
-    return {**columns, "index": np.arange(len(poses), dtype=float)}

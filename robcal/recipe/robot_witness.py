@@ -1,4 +1,4 @@
-"""What the robot and the contract have to say of cameras that moved."""
+"""What the robot has to say of cameras that moved."""
 
 from __future__ import annotations
 
@@ -7,11 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.calibrated import recorded_inputs
-from pipeline.campaign import Campaign
-from pipeline.stages.identify import options_of, require_robot
-from pipeline.stages.observations import RobotRecording, frame_observations
-from robcal.calibration.identification import identify
+from robcal.calibration.identification import IdentifyOptions, identify
+from robcal.calibration.joint_log import JointLog
+from robcal.calibration.measurements import frame_observations
 from robcal.diagnosis.core.recording import Recording
 from robcal.diagnosis.next_poses import poses_table, row_of
 from robcal.errors import RobcalError
@@ -26,18 +24,19 @@ REPEATED = 5
 
 
 def robot_misfit(
-    campaign: Campaign, orientation: StationOrientation, marks: Mapping[str, StationMarks]
+    model: RobotModel,
+    log: JointLog,
+    options: IdentifyOptions,
+    orientation: StationOrientation,
+    marks: Mapping[str, StationMarks],
 ) -> tuple[float, int] | None:
     """Whitened sum of squares that the identified robot leaves, and its redundancy; None where it cannot be found."""
-    robot, poses = require_robot(campaign)
-    kernel = Kernel(robot, campaign.entry.model.statics)
+    kernel = Kernel(model, options.statics)
     try:
         frames = measure_frames(points := measure_points(orientation, marks), orientation.body)
         made = frame_observations(points, frames)
-        recording = RobotRecording((made,), (made,), True)
-        rows = np.array([i for i in recording.poses if not poses.verify[i]], dtype=np.int64)
-        inputs = recorded_inputs(kernel, poses).subset(rows)
-        found = identify(robot, inputs, recording.select(rows), options_of(campaign, True), kernel)
+        rows = np.array([i for i in np.unique(made.pose) if not log.verify[i]], dtype=np.int64)
+        found = identify(model, log.inputs(kernel).subset(rows), [made.subset(rows)], options, kernel)
     except RobcalError:
         return None
     return float(found.sigma0**2 * found.redundancy), int(found.redundancy)

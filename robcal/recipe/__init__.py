@@ -1,0 +1,1 @@
+"""The recipe: how photogrammetry, identification and diagnosis are joined into one calibration."""

@@ -1,0 +1,63 @@
+"""The robot in force on poses that took no part."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from robcal.calibration.calibrated import CalibratedRobot
+from robcal.calibration.identification import IdentifyOptions
+from robcal.calibration.joint_log import JointLog
+from robcal.calibration.measurements import RobotRecording, Rows, well_measured
+from robcal.calibration.verification import Verification, cross_validate, fit_nominal, repetitions, verify
+from robcal.recipe.identification import Identification
+from robcal.robot.model import RobotModel
+from robcal.transforms import Array
+
+FOLDS = 5
+
+
+def verify_robot(
+    model: RobotModel,
+    identification: Identification,
+    robot: CalibratedRobot,
+    log: JointLog,
+    options: IdentifyOptions,
+    freed: RobotRecording | None = None,
+    relative: Array | None = None,
+) -> tuple[Verification, Rows, list[str]]:
+    """Verify on the kept-out poses, or by folds where there are none.
+
+    Parameters
+    ----------
+    model : the nominal robot. robot : the one in force.
+    freed : the measurements without what the diagnosis found in the measuring system; relative : covariance (p, p) of
+        the robot's parameters beside them.
+
+    Returns
+    -------
+    The verification, the rows (n,) of its poses in the joint log, and sentences on what was left out or assumed.
+    """
+    rows = identification.rows
+    recording = identification.recording if freed is None else freed
+    notes = [] if freed is None else ["verified without the errors of the measuring system that all poses share"]
+    inputs = log.inputs(robot.kernel)
+    kept_out, said = well_measured(recording, identification.kept_out(log), log.names)
+    notes += said
+    if len(kept_out):
+        nominal = fit_nominal(model, inputs.subset(rows), recording.select(rows))
+        tested = robot if relative is None else replace(robot, covariance=relative)
+        outcome = verify(tested, inputs.subset(kept_out), recording.select(kept_out), nominal)
+        if relative is not None:
+            # in the world, the robot is as uncertain as the station as well
+            _, C = robot.predict(inputs.subset(kept_out))
+            outcome = replace(outcome, predicted=np.sqrt(np.trace(C[:, :3, :3], axis1=1, axis2=2) / 3.0))
+        return outcome, kept_out, notes
+    groups = repetitions(log.q[rows])
+    folds = min(FOLDS, int(groups.max()) + 1)
+    with_terms = model.with_terms(robot.model.terms)
+    outcome = cross_validate(
+        with_terms, inputs.subset(rows), recording.select(rows), options, folds=folds, groups=groups
+    )
+    return outcome, rows, [*notes, f"no verification poses: {folds}-fold cross-validation over groups of poses"]
