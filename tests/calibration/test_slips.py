@@ -10,6 +10,7 @@ import pytest
 
 from robcal.calibration.observations import FrameObservations, Observations, PointObservations
 from robcal.calibration.slips import Slip, empty_readings, find_slips, frozen_readings, outside_limits
+from robcal.calibration.slips.joints import listed
 from robcal.robot.kernel import Kernel
 from robcal.robot.model import Frame, RobotModel
 from robcal.transforms import exp_so3, frame, frame_from_xyzrpy, invert, log_so3, rotation_from_rpy, xyzrpy_from_frame
@@ -85,9 +86,10 @@ def test_slip_of_the_log_is_named(sound: Scenario, measured: FrameObservations, 
 def test_every_set_of_wrong_senses(sound: Scenario, measured: FrameObservations, wrong: tuple[int, ...]) -> None:
     q = sound.poses.q.copy()
     q[:, list(wrong)] *= -1
-    slips = _found(sound, q, [measured])
-    assert slips[0].kind == "wrong_sign"
-    assert slips[0].where.replace(" and ", ", ").split(", ") == [f"axis{k + 1}" for k in wrong]
+    named = {slip.where: slip for slip in _found(sound, q, [measured])}
+    # all axes lie in one plane: a mirror image is the same as wrong senses of the joints across it
+    assert set(named) - {"measurements"} == {listed([f"axis{k + 1}" for k in wrong])}
+    assert ("measurements" in named) == (set(wrong) == {0, 3, 5})
 
 
 @pytest.mark.parametrize(("k", "j"), list(permutations(range(6), 2)))
@@ -108,7 +110,8 @@ def test_zeros_of_any_size_are_told_with_start_values(
     for k, value in offsets.items():
         q[:, k] -= np.radians(value)
     (slip,) = _found(sound, q, [measured])
-    assert slip.kind == "zero" and slip.legitimate
+    assert slip.kind == "zero"
+    assert slip.legitimate
     kinds = [f.joint_kind for f in sound.model.joints]
     assert set(slip.values) == {f"axis{k + 1}.{kinds[k]}" for k in offsets}
     for k, value in offsets.items():
@@ -145,15 +148,14 @@ def test_axis_of_the_robot_file(sound: Scenario, measured: FrameObservations, at
 
 
 @pytest.mark.parametrize(("at", "along", "by"), [(2, 0, 0.27), (1, 0, -0.1), (4, 0, 0.08)])
-def test_length_of_the_robot_file(
-    sound: Scenario, measured: FrameObservations, at: int, along: int, by: float
-) -> None:
+def test_length_of_the_robot_file(sound: Scenario, measured: FrameObservations, at: int, along: int, by: float) -> None:
     frames = list(sound.model.frames)
     xyz = np.array(frames[at].xyz)
     xyz[along] += by
     frames[at] = replace(frames[at], xyz=tuple(xyz.tolist()))
     slips = _found(sound, sound.poses.q, [measured], replace(sound.model, frames=tuple(frames)))
-    assert slips[0].kind == "length" and slips[0].legitimate
+    assert slips[0].kind == "length"
+    assert slips[0].legitimate
     ((name, value),) = slips[0].values.items()
     assert name.endswith(f".{'xyz'[along]}")
     assert value == pytest.approx(-by, abs=5e-3)
@@ -278,8 +280,7 @@ def test_mirrored_points(sound: Scenario, measured: FrameObservations, targets: 
     (points,) = _points(measured, targets)
     assert isinstance(points, PointObservations)
     slips = _found(sound, sound.poses.q, [replace(points, p_world=points.p_world[:, [1, 0, 2]])])
-    assert slips[0].kind == "measured_columns"
-    assert "mirror" in slips[0].statement
+    assert any(slip.kind == "measured_columns" and "mirror" in slip.statement for slip in slips)
 
 
 def test_empty_readings() -> None:

@@ -41,7 +41,7 @@ def chain_trials(recorded: Recorded) -> Iterator[Trial]:
     yield from _axes(recorded)
 
 
-def _take(order: Array) -> Callable[[Recorded], Recorded]:
+def _take(order: NDArray[np.int_]) -> Callable[[Recorded], Recorded]:
     return lambda r: r.with_q(r.poses.q[:, order])
 
 

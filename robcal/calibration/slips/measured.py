@@ -18,7 +18,7 @@ from robcal.calibration.observations import (
     SensorPointObservations,
 )
 from robcal.calibration.slips.joints import listed
-from robcal.calibration.slips.recorded import Recorded, Trial
+from robcal.calibration.slips.recorded import Recorded, Trial, as_frames
 
 Array = NDArray[np.float64]
 
@@ -34,12 +34,22 @@ def measured_trials(recorded: Recorded) -> Iterator[Trial]:
     if FrameObservations in kinds:
         yield from _columns()
         yield from _conventions()
-    if kinds & {PointObservations, SensorPointObservations}:
-        words = "the measured points are mirrored (two columns exchanged, or one with the wrong sign)"
-        yield Trial("measured_columns", WHERE, words, "correct the columns of the measurements", _on_points(_mirror))
     for factor, unit in UNITS:
         words = f"the measured lengths are in {unit}, not in mm"
         yield Trial("measured_unit", WHERE, words, "write mm into the columns _mm", _scaled(1.0 / factor))
+
+
+def mirror_trials(recorded: Recorded) -> Iterator[Trial]:
+    """Mirror images: a robot with its axes in one plane cannot tell them from wrong senses of some joints."""
+    kinds = {type(o) for o in recorded.observations}
+    kind, remedy = "measured_columns", "correct the columns of the measurements"
+    if FrameObservations in kinds:
+        mirror = np.diag([1.0, 1.0, -1.0])
+        words = "the measured frames are mirror images (left-handed axes, or images with an axis the other way)"
+        yield Trial(kind, WHERE, words, remedy, _on_frames(lambda p, a: _reflected(p, a, mirror)))
+    if kinds & {PointObservations, SensorPointObservations}:
+        words = "the measured points are mirrored (two columns exchanged, or one with the wrong sign)"
+        yield Trial(kind, WHERE, words, remedy, _on_points(lambda p: p * [1.0, 1.0, -1.0]))
 
 
 def _scaled(factor: float) -> Callable[[Recorded], Recorded]:
@@ -55,17 +65,17 @@ def _scaled(factor: float) -> Callable[[Recorded], Recorded]:
     return lambda r: r.change(scale)
 
 
-def _mirror(p: Array) -> Array:
-    return p * [1.0, 1.0, -1.0]
-
-
 def _on_points(change: Callable[[Array], Array]) -> Callable[[Recorded], Recorded]:
     def mend(o: Observations) -> Observations:
         if isinstance(o, PointObservations):
             return replace(o, p_world=change(o.p_world))
         return replace(o, p_sensor=change(o.p_sensor)) if isinstance(o, SensorPointObservations) else o
 
-    return lambda r: r.change(mend)
+    def mended(r: Recorded) -> Recorded:
+        changed = r.change(mend)
+        return replace(changed, observations=as_frames(changed.observations))
+
+    return mended
 
 
 def _on_frames(change: Callable[[Array, Array], Array]) -> Callable[[Recorded], Recorded]:
@@ -95,9 +105,6 @@ def _columns() -> Iterator[Trial]:
         parts += [f"{listed(turned)} {'has' if len(turned) == 1 else 'have'} the wrong sign"] * bool(turned)
         words = f"the measured {' and '.join(parts)}"
         yield Trial(kind, WHERE, words, remedy, _on_frames(_moved(taken, factors)))
-    mirror = np.diag([1.0, 1.0, -1.0])
-    words = "the measured frames are mirror images (left-handed axes, or images with an axis the other way)"
-    yield Trial(kind, WHERE, words, remedy, _on_frames(lambda p, a: _reflected(p, a, mirror)))
     for signs in product((1.0, -1.0), repeat=3):
         if min(signs) < 0:
             turned = [ANGLES[k] for k in range(3) if signs[k] < 0]

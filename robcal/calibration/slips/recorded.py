@@ -19,6 +19,7 @@ from robcal.robot.kernel import Kernel, PoseInputs
 from robcal.robot.model import Frame, RobotModel
 
 Array = NDArray[np.float64]
+Ints = NDArray[np.int_]
 
 CLOSEST = 0.8
 """Share of the poses, those that are missed least, that a miss is taken over: blunders are no slip of the whole."""
@@ -58,13 +59,13 @@ class Recorded:
         model = replace(self.model, frames=tuple(frames), parameters={}, terms=())
         return Recorded.of(model, self.poses, self.observations)
 
-    def paired(self, log: Array, measured: Array) -> Recorded:
+    def paired(self, log: Ints, measured: Ints) -> Recorded:
         """Measurement ``measured[i]`` beside the joint angles of row ``log[i]``."""
         observations = tuple(o.subset(measured) for o in self.observations)
         poses, flange = self.poses.subset(log), self.base_T_flange[log]
         return replace(self, poses=poses, base_T_flange=flange, observations=observations)
 
-    def subset(self, rows: Array) -> Recorded:
+    def subset(self, rows: Ints) -> Recorded:
         """The given poses."""
         return self.paired(rows, rows)
 

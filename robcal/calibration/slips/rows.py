@@ -14,7 +14,7 @@ from robcal.errors import RobcalError
 from robcal.transforms import difference
 
 Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
+Ints = NDArray[np.int_]
 
 SHIFTS = (1, -1, 2, -2, 3, -3)
 TOGETHER = "bring poses and measurements together again"
@@ -90,7 +90,9 @@ def stray_rows(recorded: Recorded) -> Iterator[Trial]:
     if np.any(source != np.arange(len(T))):
         pairs = [f"{i + 1} and {source[i] + 1}" for i in far if i < source[i]]
         words = f"the joint angles of rows {', of '.join(pairs)} are exchanged"
-        yield Trial("exchanged_rows", f"rows {', '.join(pairs)}", words, "exchange these rows", _sorted_by(source), False)
+        yield Trial(
+            "exchanged_rows", f"rows {', '.join(pairs)}", words, "exchange these rows", _sorted_by(source), False
+        )
     for shift in (1, -1):
         there = far + shift
         inside = (there >= 0) & (there < len(T))

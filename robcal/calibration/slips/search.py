@@ -9,7 +9,7 @@ import numpy as np
 
 from robcal.calibration.observations import FrameObservations, Observations
 from robcal.calibration.slips.joints import chain_trials, joint_trials
-from robcal.calibration.slips.measured import measured_trials
+from robcal.calibration.slips.measured import measured_trials, mirror_trials
 from robcal.calibration.slips.recorded import Recorded, Slip, Trial, as_frames, miss, workspace
 from robcal.calibration.slips.rows import row_trials, stray_rows
 from robcal.calibration.slips.zeros import deviating
@@ -63,7 +63,10 @@ def _groups(
     """The searches, simple slips first: ``fast`` where frames give base and tool in closed form."""
     few = _spread(recorded, fast)
     if suspicious:
-        yield lambda: _proved(joint_trials(recorded, fast), recorded, few)
+        yield lambda: [
+            *_proved(joint_trials(recorded, fast), recorded, few),
+            *_proved(mirror_trials(plain), plain, _spread(plain, fast), recorded),
+        ]
         yield lambda: _proved(row_trials(recorded), recorded, recorded)
         if fast:
             yield lambda: _proved(chain_trials(recorded), recorded, few)
@@ -86,15 +89,14 @@ def _spread(recorded: Recorded, fast: bool) -> Recorded:
     return recorded.subset(np.unique(np.linspace(0, n - 1, SCREENED).astype(np.int64)))
 
 
-def _proved(trials: Iterator[Trial], recorded: Recorded, few: Recorded) -> list[Slip]:
+def _proved(trials: Iterator[Trial], recorded: Recorded, few: Recorded, unmended: Recorded | None = None) -> list[Slip]:
     """Trials that mend the miss: of a few poses first, then of all."""
-    before = {robust: miss(few, robust) for robust in (True, False)}
-    whole_of = {robust: miss(recorded, robust) for robust in (True, False)}
+    before = {robust: miss(unmended or recorded, robust) for robust in (True, False)}
     told: list[Slip] = []
     for trial in trials:
         if few is not recorded and miss(trial.mend(few), trial.robust) > 2.0 * PROOF * before[trial.robust]:
             continue
-        whole = whole_of[trial.robust]
+        whole = before[trial.robust]
         mended = trial.mend(recorded)
         after = miss(mended, trial.robust)
         if after < min(PROOF * whole, as_robots_do(mended)):
