@@ -35,7 +35,7 @@ ADEQUATE = 1e-3
 DEGENERATE = 1e-6
 """Singular values below this share of the largest are directions that the images do not show."""
 ALIKE, ALIKE_DIRECTION, CLASS = 1.6, 0.9, 3
-"""Ratio of sizes and cosine of directions within which shifts are alike; that many alike are no set of single shifts."""
+"""Ratio of sizes, cosine of directions within which shifts are alike; so many alike are no set of single shifts."""
 LEFT_OVER = 0.2
 """Significance of a smooth field beside a named cause, and its share of what that explains, from which the name does
 not hold."""
