@@ -9,7 +9,9 @@ from typing import Any
 from pipeline.adjusted_images import findings_of
 from pipeline.bodies import body_for_robot
 from pipeline.campaign import Campaign
-from pipeline.runs import Run, write_json
+from pipeline.json_io import write_json
+from pipeline.messages import LOG
+from pipeline.runs import Run
 from pipeline.stages.base import Context, Outcome, Stage, no_files
 from pipeline.stages.identify import load_identification
 from pipeline.tables import write_table
@@ -37,9 +39,7 @@ def work(context: Context) -> Outcome:
     station = _own_station(run)
     measured = Measured(body_for_robot(campaign, run), run.load("points") if run.has("points") else None, station)
     identification = load_identification(run)
-    found = diagnose_robot(
-        identification, campaign.poses, measured, images, settings_of(campaign), context.messages.info
-    )
+    found = diagnose_robot(identification, campaign.poses, measured, images, settings_of(campaign), LOG.info)
     if found is None:
         return Outcome(notes=["nothing to diagnose"])
     diagnosis = found.diagnosis

@@ -14,9 +14,9 @@ from scipy import linalg, sparse, stats
 from robcal.diagnosis.images.data import LENS_TERMS, ImageData
 from robcal.diagnosis.images.diagnosis import spread_of_others
 from robcal.diagnosis.scan.statistics import orthonormal_basis
+from robcal.estimation.grouping import sum_by
 from robcal.photogrammetry.core.bodies import Body
 from robcal.photogrammetry.core.camera import Camera
-from robcal.photogrammetry.core.grouping import sum_by
 from robcal.photogrammetry.station.adjustment import global_columns, interior_basis, interior_prior
 from robcal.photogrammetry.station.network import StationDesign, StationOrientation, StationSettings, Unknowns
 from robcal.photogrammetry.station.scan import scan_moves

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy import stats
 
+from robcal.estimation.grouping import sum_by
 from robcal.photogrammetry.core.bodies import Body, IntArray
-from robcal.photogrammetry.core.grouping import sum_by
 from robcal.photogrammetry.measure.measured_points import RejectedPoint, ResectedPoses
 from robcal.photogrammetry.orientation.resection import PoseFit, Resection, refine_poses, resect_images
 from robcal.photogrammetry.station.adjustment import interior_basis, linearise
