@@ -32,7 +32,7 @@ def detect_targets(image: NDArray, settings: DetectionSettings = _DEFAULT) -> De
 
     Parameters
     ----------
-    image : (h, w) uint8 or uint16; not changed. settings : what to look for.
+    image : (h, w) uint8 or uint16; not changed. settings : of the detection.
 
     Returns
     -------
@@ -45,7 +45,7 @@ def detect_targets(image: NDArray, settings: DetectionSettings = _DEFAULT) -> De
     Notes
     -----
     Weakness: a lamp or reflection that is a clean ellipse within the size limits is reported as an uncoded dot; only
-    geometry can tell later. Covariances hold for the centre of the dot's image ellipse, not for its eccentricity.
+    geometry can decide later. Covariances hold for the centre of the dot's image ellipse, not for its eccentricity.
     """
     _check(image)
     noise = estimate_noise(image)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +34,9 @@ class Prediction:
     error_px: float = 3.0
 
 
+IdentificationMethod = Literal["codes", "prediction", "search", "rows", "none"]
+
+
 @dataclass(frozen=True)
 class IdentifiedImage:
     """Targets identified in one image.
@@ -50,7 +54,7 @@ class IdentifiedImage:
     rows: IntArray
     ids: IntArray
     camera_T_body: Array | None
-    method: str
+    method: IdentificationMethod
     alternatives: tuple[Array, ...] = ()
     reason: str = ""
     view: View | None = None
@@ -295,7 +299,7 @@ class _Start:
     rows: IntArray
     ids: IntArray
     prediction: Prediction
-    method: str
+    method: IdentificationMethod
 
 
 class _Growth:

@@ -9,9 +9,10 @@ import numpy as np
 from scipy import stats
 
 from robcal.photogrammetry.station.adjustment import Adjusted, global_columns, interior_offset
-from robcal.photogrammetry.station.network import GROUPS, Evidence, RejectedMark, movement
+from robcal.photogrammetry.station.network import GROUPS, Evidence, EvidenceKind, RejectedMark, movement
 from robcal.photogrammetry.station.scan import scan_moves, scan_targets
 from robcal.photogrammetry.station.state import StationState
+from robcal.transforms import Array
 
 _MOVE_LIMIT = 80.0
 """Chi-square (6) above which a camera is taken to have moved: about 1e-14 for one test, far beyond 1e-6 for all tests
@@ -31,10 +32,11 @@ class Cleaned:
 
 
 def resolve_contradictions(state: StationState, adjusted: Adjusted) -> Cleaned:
-    """Largest recurring contradiction first: free what it concerns (or leave a slipped image out), adjust, look again.
+    """Largest recurring contradiction first: free the parameters concerned (or leave a slipped image out), adjust,
+    scan again.
 
     Weakness: with two cameras a move is only seen as a relative one; it is booked on the camera that does not define
-    the world. With fewer than six targets of which three are wrong the majority cannot be told.
+    the world. With fewer than six targets of which three are wrong the majority cannot be determined.
     """
     evidence: list[Evidence] = []
     rejected: list[RejectedMark] = []
@@ -80,7 +82,11 @@ def _strongest(state: StationState, adjusted: Adjusted) -> Evidence | None:
     e, c, p = len(state.exterior_camera), len(state.names), len(state.poses)
     if c > 1 and state.settings.detect_moves:
         scan = scan_moves(design, marks, c, p, global_columns(marks, e, c))
-        for kind, table in (("camera_moved", scan.from_pose), ("image_rejected", scan.single)):
+        tables: tuple[tuple[EvidenceKind, Array], ...] = (
+            ("camera_moved", scan.from_pose),
+            ("image_rejected", scan.single),
+        )
+        for kind, table in tables:
             table = table.copy()
             fixed = state.exterior_camera[list(state.fixed)]
             table[fixed] *= 1.0 - 1e-3  # of two equal answers, the camera that does not define the world
@@ -123,7 +129,7 @@ def _worst_target(state: StationState, adjusted: Adjusted) -> Evidence | None:
         return None
     ident = int(state.body.ids[i])
     size = 1e3 * np.linalg.norm(scan.error[i])
-    text = f"target {ident} of body {state.body.name} is {size:.3g} mm from where its file says"
+    text = f"target {ident} of body {state.body.name} is {size:.3g} mm from its place in the file"
     return Evidence(
         "target_shifted", str(ident), None, scan.error[i], scan.covariance[i], float(scan.statistic[i]), 3, text
     )
@@ -176,8 +182,8 @@ def snoop(state: StationState) -> tuple[Adjusted, tuple[RejectedMark, ...]]:
     """
     rejected: list[RejectedMark] = []
     limit = float(stats.chi2.isf(2 * stats.norm.sf(state.settings.critical), 2))
-    # Gross errors are told by the median's scale, which they do not spoil; what is merely large is then judged by the
-    # root mean square, so that measurements with somewhat long tails are not thinned out.
+    # Gross errors are detected by the median's scale, which they do not spoil; what is merely large is then judged by
+    # the root mean square, so that measurements with somewhat long tails are not thinned out.
     for robust, level in ((True, 4.0 * limit), (False, limit)):
         state.update_noise(state.adjust(None), robust=robust)
         adjusted = state.adjust(None)

@@ -92,7 +92,8 @@ def with_recurring_codes(
 ) -> dict[tuple[str, int], IdentifiedImage]:
     """The images with those codes that the pose of nearly every image contradicts: no misreading recurs like that.
 
-    It is the target that sits elsewhere or carries another one's number; what comes after can tell only if it is there.
+    It is the target that sits elsewhere or carries another one's number; later steps can detect that only if it is
+    there.
     """
     read: Counter[int] = Counter()
     against: Counter[int] = Counter()
@@ -172,7 +173,7 @@ def _orient(
         settings = StationSettings(detect_moves=False, detect_targets=False)
         return orient_station(marks, body, cameras, sizes, settings=settings)
     except RobcalError:
-        return None  # the second round is a help only; what is wrong with the station is said by its own stage
+        return None  # the second round is a help only; faults of the station are reported by its own stage
 
 
 def spread_order(points: Array, known: NDArray[np.bool_]) -> IntArray:

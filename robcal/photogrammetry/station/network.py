@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -99,6 +100,18 @@ def movement(camera: str, pose: int, shift: Array) -> str:
     return f"camera {camera} stands elsewhere from pose {pose} on, by {length:.3g} mm and {turn:.2g} deg"
 
 
+EvidenceKind = Literal[
+    "camera_moved",
+    "image_rejected",
+    "target_shifted",
+    "target_swapped",
+    "lens_radial",
+    "lens_tangential",
+    "lens_affinity",
+]
+RejectionKind = Literal["outlier", "recurring", "contradiction", "no_pose"]
+
+
 @dataclass(frozen=True)
 class Evidence:
     """Something in the data that contradicts the model again and again, with its test.
@@ -110,7 +123,7 @@ class Evidence:
     ``alone``: other data exclude that it was another camera.
     """
 
-    kind: str
+    kind: EvidenceKind
     where: str
     pose: int | None
     estimate: Array
@@ -134,7 +147,7 @@ class RejectedMark:
     pose: int
     target: int
     reason: str
-    kind: str = "outlier"
+    kind: RejectionKind = "outlier"
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from robcal.photogrammetry.station.cleaning import drop_insignificant, resolve_c
 from robcal.photogrammetry.station.network import (
     GROUPS,
     Evidence,
+    EvidenceKind,
     RejectedMark,
     StationMarks,
     StationOrientation,
@@ -177,11 +178,15 @@ def _lens_evidence(state: StationState, adjusted: Adjusted, given: Mapping[str, 
     out: list[Evidence] = []
     e = len(state.exterior_camera)
     offset = interior_offset(state.unknowns, state.prior)
-    families = {"radial": ("k1", "k2", "k3"), "tangential": ("tangential",), "affinity": ("affinity",)}
+    families: tuple[tuple[EvidenceKind, str, tuple[str, ...]], ...] = (
+        ("lens_radial", "radial", ("k1", "k2", "k3")),
+        ("lens_tangential", "tangential", ("tangential",)),
+        ("lens_affinity", "affinity", ("affinity",)),
+    )
     for c, name in enumerate(state.names):
         if given.get(name) is None or state.settings.intrinsics == "fixed":
             continue
-        for family, groups in families.items():
+        for kind, family, groups in families:
             found = [g for g in groups if g in state.groups[c]]
             if not found or any(g in state.kept[c] for g in groups):
                 continue
@@ -191,7 +196,7 @@ def _lens_evidence(state: StationState, adjusted: Adjusted, given: Mapping[str, 
             d = offset[c, numbers]
             statistic = float(d @ np.linalg.solve(Q, d))
             text = f"camera {name} has {family} distortion ({', '.join(found)}) that its file does not have"
-            out.append(Evidence(f"lens_{family}", name, None, d, Q, statistic, len(at), text))
+            out.append(Evidence(kind, name, None, d, Q, statistic, len(at), text))
     return tuple(out)
 
 
@@ -210,7 +215,7 @@ def _result(
     raw = design.residual * state.noise[marks.camera][:, None]
     sigma0 = float(np.sqrt(np.sum(raw**2) / total)) if total > 0 else float("nan")
     pixels = np.einsum("mij,mj->mi", np.linalg.inv(design.whitening), design.residual)
-    # exterior and interior covariance, the interior in its nine numbers
+    # exterior and interior covariance, the interior in its nine parameters
     station = slice(0, 6 * e + 9 * c)
     to_numbers = np.eye(6 * e + 9 * c)
     basis = interior_basis(x.interior)

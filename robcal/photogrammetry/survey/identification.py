@@ -45,7 +45,7 @@ def identify_uncoded(given: SurveyInput, table: Assignments, adjusted: Adjusted)
         last = round_ == _ROUNDS - 1 or gained < 0.02 * before
         table, adjusted = readjust(given, table, network, final if last else provisional)
     if "fx" not in adjusted.network.free_intrinsics and not final.settings.hold_focal:
-        # held only for the time of the matching; now it must be determined, or be said not to be
+        # held only for the time of the matching; now it must be determined, or reported as undetermined
         table, adjusted = readjust(given, table, adjusted.network, final)
     return table, adjusted
 

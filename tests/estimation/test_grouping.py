@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from robcal.photogrammetry.core.grouping import sum_by, whitener
+from robcal.estimation.grouping import sum_by, whitener
 
 
 @pytest.mark.parametrize(("m", "n"), [(50, 4), (30_000, 7), (10, 1)])
