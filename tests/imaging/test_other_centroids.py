@@ -2,8 +2,9 @@
 
 import numpy as np
 
+from robcal.imaging.detect import detect_targets
 from robcal.imaging.other_centroids import contour_centres, grey_centroids
-from tests.imaging.rendering import Dot, expose, render
+from tests.imaging.rendering import Dot, expose, render, scene
 
 
 def test_both_are_near_on_an_even_dot() -> None:
@@ -24,3 +25,24 @@ def test_no_contour_is_nan() -> None:
     flat = np.full((40, 40), 20, np.uint8)
     centre = contour_centres(flat, np.array([[20.0, 20.0]]), np.array([[5.0, 5.0]]), np.array([20.0]), np.array([50.0]))
     assert np.isnan(centre).all()
+
+
+def test_only_doubtful_dots_get_a_second_centre() -> None:
+    rng = np.random.default_rng(5)
+    light = render(400, 300, scene(rng, 400, 300, 20, (5.0, 9.0), [], 2.5))
+    found = detect_targets(expose(light, rng))
+    assert len(found) == 20
+    assert np.isnan(found.contour_offset).all()
+    assert not found.contradicted.any()
+
+
+def test_a_dot_that_is_partly_covered_is_contradicted() -> None:
+    rng = np.random.default_rng(6)
+    light = render(120, 120, [Dot(60.0, 60.0, 12, 12)])
+    light[54:66, 66:74] *= 0.75  # a translucent fleck inside its right half
+    found = detect_targets(expose(light, rng, read_noise=0.5, gain=0.0))
+    assert len(found) == 1
+    assert found.contour_offset[0] > 0.15
+    assert found.contradicted[0]
+    clean = detect_targets(expose(render(120, 120, [Dot(60.0, 60.0, 12, 12)]), rng, read_noise=0.5, gain=0.0))
+    assert np.isnan(clean.contour_offset[0])

@@ -9,7 +9,7 @@ import numpy as np
 from scipy import linalg
 
 from robcal.errors import InvalidInput
-from robcal.photogrammetry.core.network import IntArray, LengthResult, Lengths
+from robcal.photogrammetry.core.network import IntArray, LengthKind, LengthResult, Lengths
 from robcal.transforms import Array
 
 _NOTE = 3.3
