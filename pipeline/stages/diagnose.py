@@ -15,7 +15,7 @@ from pipeline.runs import Run
 from pipeline.stages.base import Context, Outcome, Stage, no_files
 from pipeline.stages.identify import load_identification
 from pipeline.tables import write_table
-from robcal.diagnosis.content import as_contract, with_images
+from robcal.diagnosis.content import diagnosis_content, with_images
 from robcal.diagnosis.core.result import Diagnosis
 from robcal.diagnosis.images.diagnosis import ImageFinding
 from robcal.diagnosis.search.selection import SelectionSettings
@@ -43,7 +43,7 @@ def work(context: Context) -> Outcome:
     if found is None:
         return Outcome(notes=["nothing to diagnose"])
     diagnosis = found.diagnosis
-    content = with_images(as_contract(diagnosis), images.findings, images.scans, images.noise)
+    content = with_images(diagnosis_content(diagnosis), images.findings, images.scans, images.noise)
     if station is not None and found.recording.own_station:
         content = with_station_moves(content, station.names, found.recording, diagnosis.model)
     write_json(run.diagnosis, content)
@@ -83,13 +83,13 @@ def _columns(rows: Any) -> dict[str, list[object]]:
 
 
 def _named(findings: Sequence[ImageFinding]) -> list[dict[str, Any]]:
-    return [{"cause": f.cause, "where": f.where, "direction": f.direction} for f in findings]
+    return [{"cause": f.name, "where": f.where, "direction": f.direction} for f in findings]
 
 
 def _result(diagnosis: Diagnosis) -> dict[str, Any]:
     before, after, floor = (v * 1000 for v in diagnosis.heldout)
     causes: Sequence[dict[str, Any]] = [
-        {"cause": f.family.cause, "where": f.family.where, "direction": f.family.direction} for f in diagnosis.findings
+        {"cause": f.cause.name, "where": f.cause.where, "direction": f.cause.direction} for f in diagnosis.findings
     ]
     return {
         "mismatch": diagnosis.mismatch,

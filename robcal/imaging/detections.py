@@ -14,7 +14,7 @@ Array = NDArray[np.float64]
 
 
 CONTOUR_SIGMA = 0.02
-"""Standard deviation, px, of the centre of an ellipse through a contour at half height (rendered dots, 2.5 to 16 px)."""
+"""Standard deviation, px, of the centre of an ellipse through a contour at half height (rendered dots)."""
 
 
 class TargetKind(IntEnum):
@@ -120,13 +120,9 @@ class Detections:
 
     @property
     def contradicted(self) -> NDArray[np.bool_]:
-        """(n,) doubtful dots whose two centres disagree by more than four standard deviations and their shading.
-
-        Shading by a relative gradient g per px moves the contour at half height by about g times the semi-axis.
-        """
+        """(n,) doubtful dots whose two centres disagree by more than three standard deviations."""
         sigma = np.hypot(CONTOUR_SIGMA, np.sqrt(np.trace(self.covariance, axis1=1, axis2=2) / 2.0))
-        shading = np.linalg.norm(self.gain_gradient, axis=1) * self.semi_axes[:, 0]
-        return np.asarray(self.contour_offset > 4.0 * sigma + shading)
+        return np.asarray(self.contour_offset > 3.0 * sigma)
 
     def columns(self) -> dict[str, NDArray]:
         """The per-target arrays by name."""

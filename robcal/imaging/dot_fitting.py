@@ -110,7 +110,8 @@ def fit_dots(
     results = []
     for window, fit, rows in zip(groups, fits, uneven, strict=True):
         sigma = np.where(rows, np.maximum(shading[window.index], _UNEVEN_SHADING), shading[window.index])
-        results.append(_finish(fit, window, noise, sigma, candidates))
+        # a ringed dot is fitted again without its ring, under the prior of the image
+        results.append(_finish(fit, window, noise, sigma, candidates) | {"shading_sigma": shading[window.index]})
     return _join(results, groups), noise, prior
 
 

@@ -21,6 +21,7 @@ from robcal.diagnosis.search.selection import SelectionSettings
 from robcal.photogrammetry.core.bodies import Body
 from robcal.photogrammetry.measure.measured_points import MeasuredPoints
 from robcal.photogrammetry.station.network import StationOrientation
+from robcal.physics.cause import ObservationCause
 from robcal.physics.prior_scale import DEVIATION
 from robcal.recipe.corrections import corrected
 from robcal.recipe.evidence import Evidence, evidence_of
@@ -29,7 +30,6 @@ from robcal.recipe.image_findings import ImageFindings
 from robcal.recipe.recording import recording_for_diagnosis
 from robcal.transforms import Array
 
-UNCORRECTED = frozenset({"refraction", "ellipse_eccentricity", "centroid_bias"})
 BEYOND_DOUBT = 1e-6
 
 
@@ -178,7 +178,7 @@ def settings_beside(settings: SelectionSettings, findings: Sequence[ImageFinding
 
     What they leave in the frames looks like small causes of the robot; only what is far beyond doubt is told.
     """
-    if any(finding.cause in UNCORRECTED for finding in findings):
+    if any(finding.kind.displaces_marks for finding in findings):
         return replace(settings, level=min(settings.level, BEYOND_DOUBT))
     return settings
 
@@ -192,9 +192,9 @@ def _relative_covariance(diagnosis: Diagnosis, recording: Recording) -> Array:
 def _final(diagnosis: Diagnosis, recording: Recording, iterations: int = 8) -> Fit:
     """The extended model at the recording: its terms are in the model, observation causes beside it."""
     direct = [
-        Accepted(f.family, f.constants, f.values, f.covariance)
+        Accepted(f.cause, f.constants, f.values, f.covariance)
         for f in diagnosis.findings
-        if f.family.displace is not None
+        if isinstance(f.cause, ObservationCause)
     ]
     clean = recording.subset(~np.isin(np.array(recording.names), diagnosis.blunders))
     return fit(diagnosis.model, clean, diagnosis.free, direct, iterations=iterations)

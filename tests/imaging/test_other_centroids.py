@@ -36,13 +36,14 @@ def test_only_doubtful_dots_get_a_second_centre() -> None:
     assert not found.contradicted.any()
 
 
-def test_a_dot_that_is_partly_covered_is_contradicted() -> None:
+def test_a_dot_with_a_fleck_is_contradicted_and_no_other() -> None:
     rng = np.random.default_rng(6)
-    light = render(120, 120, [Dot(60.0, 60.0, 12, 12)])
-    light[54:66, 66:74] *= 0.75  # a translucent fleck inside its right half
-    found = detect_targets(expose(light, rng, read_noise=0.5, gain=0.0))
-    assert len(found) == 1
-    assert found.contour_offset[0] > 0.15
-    assert found.contradicted[0]
-    clean = detect_targets(expose(render(120, 120, [Dot(60.0, 60.0, 12, 12)]), rng, read_noise=0.5, gain=0.0))
-    assert np.isnan(clean.contour_offset[0])
+    dots = [Dot(50.0 + 80 * i, 50.0 + 80 * j, 12, 11, 0.3 * i) for i in range(4) for j in range(3)]
+    light = render(340, 260, dots)
+    light[44:56, 56:64] *= 0.75  # translucent, inside the right half of the first dot
+    found = detect_targets(expose(light, rng))
+    assert len(found) == 12
+    first = int(np.argmin(np.linalg.norm(found.xy - 50.0, axis=1)))
+    assert found.contour_offset[first] > 0.1
+    assert np.flatnonzero(found.contradicted).tolist() == [first]
+    assert np.isfinite(found.contour_offset).sum() == 1

@@ -14,6 +14,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from robcal.cause import Cause
 from robcal.errors import InvalidInput
 from robcal.photogrammetry.core.bodies import Body, IntArray
 from robcal.photogrammetry.core.camera import Camera
@@ -100,31 +101,19 @@ def movement(camera: str, pose: int, shift: Array) -> str:
     return f"camera {camera} stands elsewhere from pose {pose} on, by {length:.3g} mm and {turn:.2g} deg"
 
 
-EvidenceKind = Literal[
-    "camera_moved",
-    "image_rejected",
-    "target_shifted",
-    "target_swapped",
-    "lens_radial",
-    "lens_tangential",
-    "lens_affinity",
-]
 RejectionKind = Literal["outlier", "recurring", "contradiction", "no_pose"]
 
 
 @dataclass(frozen=True)
-class Evidence:
+class StationCause(Cause):
     """Something in the data that contradicts the model again and again, with its test.
 
-    ``kind``: 'camera_moved', 'target_shifted', 'target_swapped' (``where``: both ids), 'lens_radial',
-    'lens_tangential', 'lens_affinity'; ``where``: camera or target; ``pose``: first
-    pose concerned or None; ``estimate`` and ``covariance`` in the units of the kind (shift m, turn rad in the camera's
-    or the body's coordinates); ``statistic`` chi-square with ``degrees`` of freedom; ``statement`` a sentence;
-    ``alone``: other data exclude that it was another camera.
+    `kind` is one of :mod:`robcal.photogrammetry.station.contradictions`; `where`: camera or target; `pose`: first pose
+    concerned or None; `estimate` and `covariance` in the units of the kind (shift m, turn rad in the camera's or the
+    body's coordinates); `statistic` chi-square with `degrees` of freedom; `statement` a sentence; `alone`: other data
+    exclude that it was another camera; `partner`: the other one of two swapped targets.
     """
 
-    kind: EvidenceKind
-    where: str
     pose: int | None
     estimate: Array
     covariance: Array
@@ -132,6 +121,7 @@ class Evidence:
     degrees: int
     statement: str
     alone: bool = False
+    partner: str = ""
 
 
 @dataclass(frozen=True)
@@ -267,7 +257,7 @@ class StationOrientation:
     redundancy_total: float
     rms_px: float
     rejected: tuple[RejectedMark, ...]
-    evidence: tuple[Evidence, ...]
+    evidence: tuple[StationCause, ...]
     free_interior: Mapping[str, tuple[str, ...]]
     converged: bool
     iterations: int
