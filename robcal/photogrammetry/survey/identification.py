@@ -14,7 +14,8 @@ from robcal.photogrammetry.survey.adjusting import Adjusted, Step, readjust
 from robcal.photogrammetry.survey.assignments import Assignments, sightings_in
 from robcal.photogrammetry.survey.inputs import SurveyInput
 from robcal.photogrammetry.survey.late_images import place_late
-from robcal.photogrammetry.survey.matching import Geometry, find_new_points, is_dot, match_known, seen_diameters
+from robcal.photogrammetry.survey.matching import Geometry, is_dot, match_known, seen_diameters
+from robcal.photogrammetry.survey.new_points import find_new_points
 from robcal.transforms import Array
 
 FIRST_NEW_ID = 4096
