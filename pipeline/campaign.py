@@ -14,11 +14,12 @@ from robcal.files.body_file import BodyFile, check_ring_codes, read_body
 from robcal.files.camera_file import CameraFile, read_camera
 from robcal.files.camera_import import split_choice
 from robcal.files.images import list_images
-from robcal.files.measurement_tables import MarksTable, MeasuredTable, read_marks, read_measurements
+from robcal.files.measurement_tables import MarksTable, MeasuredTable, read_marks, read_measurements, without_frozen
 from robcal.files.poses_table import Poses, read_poses
 from robcal.files.robot_import import read_any_robot
 from robcal.files.schemas import parse, proposal
 from robcal.files.yaml_io import YamlDocument, read_yaml
+from robcal.robot.chain import chain_of, forward
 from robcal.robot.model import RobotModel
 
 
@@ -157,6 +158,9 @@ class _Reader:
         measurements = tuple(
             read_measurements(self._file(name), poses.names if poses else ()) for name in entry.measurements
         )
+        if robot is not None and poses is not None:
+            places = forward(chain_of(robot), poses.q)[:, :3, 3]
+            measurements = tuple(without_frozen(table, places, poses.names) for table in measurements)
         for table in measurements:
             self.warnings.extend(table.notes)
             self._check_targets(table, bodies)

@@ -74,7 +74,7 @@ def check_joint_limits(campaign: Campaign, run: Run) -> None:
         kernel = Kernel(robot, campaign.entry.model.statics)
         try:
             recording = build_recording(campaign, run, body_for_robot(campaign, run))
-            fault = fault_of(robot, poses.inputs(kernel), recording, kernel)
+            fault = fault_of(robot, poses.inputs(kernel), recording)
         except RobcalError:
             fault = ""  # what else is wrong comes to light once the angles are within the ranges
     raise InvalidInput(poses.outside + (f"; a likely cause: {fault}" if fault else ""))

@@ -66,7 +66,7 @@ def observations_of(table: MeasuredTable, body: Body | None) -> RobotObservation
         covariance = table.covariance
         if covariance is None:
             covariance = np.broadcast_to(ASSUMED_SIGMA**2 * np.eye(6), (len(table), 6, 6))
-        return FrameObservations(table.pose, table.values, covariance)
+        return FrameObservations(table.pose, table.values, covariance, table.angles)
     if table.kind == "distances":
         sigma = np.full(len(table), ASSUMED_SIGMA) if table.covariance is None else np.sqrt(table.covariance)
         return DistanceObservations(table.pose, table.values, sigma)
