@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from robcal import transforms as tf
 from robcal.calibration.calibrated import CalibratedRobot
+from robcal.calibration.deficiency import describe_deficiency
 from robcal.calibration.identifiability import check_poses, choose_candidates, observability_indices
 from robcal.calibration.observations import FrameObservations, Observations, Stack, basis_points
 from robcal.calibration.outliers import PoseStatistics, find_outliers, pose_statistics
@@ -78,6 +79,7 @@ class IdentifiedRobot(CalibratedRobot):
     outliers : rows of poses left out; used : (n,) mask of the others.
     first_summary, summary : of the first iteration (from the start values) and of the last one, after the choice of
         parameters; iterations counts all Gauss-Newton steps; seconds : kernel, start and solution.
+    deficiency : why the poses cannot separate base and tool, with the remedy; empty where they do.
     """
 
     sigma0: float
@@ -101,6 +103,7 @@ class IdentifiedRobot(CalibratedRobot):
     iterations: int
     seconds: float
     seconds_kernel: float
+    deficiency: str = ""
 
     def strong_correlations(self, level: float = 0.95) -> list[tuple[str, str, float]]:
         """Pairs of parameters correlated more than ``level``, strongest first."""
@@ -175,7 +178,7 @@ def start_state(evaluator: Evaluator, observations: Sequence[Observations]) -> S
     kernel = evaluator.kernel
     cell = CellEvaluator(evaluator)
     theta = cell.theta
-    pairs = candidates(cell.base_T_flange, observations)
+    pairs = candidates(cell.base_T_flange, observations, kernel.model.flange_T_tool)
     if kernel.model.world_T_base is not None and kernel.model.flange_T_tool is not None:
         given = kernel.theta0
         pairs.append(
@@ -238,6 +241,10 @@ def _result(
     model = replace(
         kernel.model.with_parameters(values), world_T_base=state.world_T_base, flange_T_tool=state.flange_T_tool
     )
+    used = weights > 0
+    flange = CellEvaluator(engine.evaluator).base_T_flange
+    sigma = dict(zip(solution.names, np.sqrt(scale * np.diag(statistics.cofactor)).tolist(), strict=True))
+    deficiency = describe_deficiency(kernel.model, engine.poses.q[used], flange[used], solution.eliminated, sigma)
     joint_sigma = np.sqrt(scale) * np.asarray(options.joint_sigma or 0.0, dtype=float)
     return IdentifiedRobot(
         model=model,
@@ -260,7 +267,8 @@ def _result(
         leverage=poses.leverage,
         redundancy_numbers=poses.redundancy,
         outliers=tuple(outliers),
-        used=weights > 0,
+        used=used,
+        deficiency=deficiency,
         options=options,
         first_summary=solution.first,
         summary=solution.summary,
