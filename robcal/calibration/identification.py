@@ -2,7 +2,7 @@
 
 Start values by construction, whitening with the measured covariances, Gauss-Newton with halving line search, named
 elimination of dependent parameters, choice of elasticities by evidence, outlier poses, covariance and diagnostics.
-Sources: thesis chapter 5 for objective and solver; adjustment statistics after Foerstner and Wrobel (2016), chapter 4.
+Source of the adjustment statistics: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, chapter 4.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class IdentifyOptions:
     ----------
     parameters : 'standard', 'geometry', 'table5.4' or a list of names; base, tool and terms are always added.
     robust : leave out single poses that contradict all others (and report them).
-    objective : 'maximum_likelihood' (whitened with the measured covariance) or 'basis' (the thesis' norm).
+    objective : 'maximum_likelihood' (whitened with the measured covariance) or 'basis' (equal weights).
     statics : 'one_step' or 'converged'.
     joint_sigma : repeatability of the joints, rad or m, one number or one a joint; adds to the covariances.
     priors : standard deviations (around zero) by parameter name, for those that have one.
@@ -263,7 +263,7 @@ def _result(
         correlations=statistics.correlations,
         observability=observability_indices(statistics.singular_values),
         residuals=poses.residuals,
-        normalised=np.sqrt(poses.square),
+        normalised=np.sqrt(poses.mean_square),
         leverage=poses.leverage,
         redundancy_numbers=poses.redundancy,
         outliers=tuple(outliers),
