@@ -101,8 +101,8 @@ class IdentifiedRobot(CalibratedRobot):
     first_summary: SolveSummary
     summary: SolveSummary
     iterations: int
-    seconds: float
-    seconds_kernel: float
+    seconds: float = 0.0
+    seconds_kernel: float = 0.0
     deficiency: str = ""
 
     def strong_correlations(self, level: float = 0.95) -> list[tuple[str, str, float]]:
@@ -165,7 +165,8 @@ def identify(
     final = engine.choose(first, weights) if choice.own_axis or choice.cross_axis else first
     if statistics is None or final is not first:
         statistics = pose_statistics(final, weights, stack)
-    return _result(engine, options, final, weights, outliers, statistics, clock, seconds_kernel)
+    result = _result(engine, options, final, weights, outliers, statistics)
+    return replace(result, seconds=time.perf_counter() - clock, seconds_kernel=seconds_kernel)
 
 
 def start_state(evaluator: Evaluator, observations: Sequence[Observations]) -> State:
@@ -219,8 +220,6 @@ def _result(
     weights: Array,
     outliers: list[int],
     poses: PoseStatistics,
-    clock: float,
-    seconds_kernel: float,
 ) -> IdentifiedRobot:
     kernel, stack = engine.kernel, engine.stack
     r, J = solution.problem.linearise(solution.state)
@@ -236,18 +235,13 @@ def _result(
     sigma0, p_value = global_test(0.5 * float(r @ r), redundancy)
     scaled = options.covariance == "estimated" or (options.covariance == "auto" and p_value < 0.01)
     scale = sigma0**2 if scaled and redundancy > 0 else 1.0
-    state = solution.state
-    values = {n: float(v) for n, v in zip(kernel.names, state.theta, strict=True)}
-    model = replace(
-        kernel.model.with_parameters(values), world_T_base=state.world_T_base, flange_T_tool=state.flange_T_tool
-    )
     used = weights > 0
     flange = CellEvaluator(engine.evaluator).base_T_flange
     sigma = dict(zip(solution.names, np.sqrt(scale * np.diag(statistics.cofactor)).tolist(), strict=True))
     deficiency = describe_deficiency(kernel.model, engine.poses.q[used], flange[used], solution.eliminated, sigma)
     joint_sigma = np.sqrt(scale) * np.asarray(options.joint_sigma or 0.0, dtype=float)
     return IdentifiedRobot(
-        model=model,
+        model=_model_at(kernel, solution.state),
         names=solution.names,
         statics=options.statics,
         joint_sigma=joint_sigma.tolist(),
@@ -273,6 +267,12 @@ def _result(
         first_summary=solution.first,
         summary=solution.summary,
         iterations=solution.iterations,
-        seconds=time.perf_counter() - clock,
-        seconds_kernel=seconds_kernel,
+    )
+
+
+def _model_at(kernel: Kernel, state: State) -> RobotModel:
+    """The kernel's robot with the parameters and references of a state."""
+    values = {n: float(v) for n, v in zip(kernel.names, state.theta, strict=True)}
+    return replace(
+        kernel.model.with_parameters(values), world_T_base=state.world_T_base, flange_T_tool=state.flange_T_tool
     )
