@@ -154,8 +154,8 @@ class _Reader:
             self.notes.extend(poses.notes)
         if robot is not None and entry.poses is not None and without_masses(robot):
             self.notes.append(
-                "the robot file states no masses (mass_kg, cog_mm): sag under the arm's own weight is identified where the "
-                "poses show it, but what another payload does to the arm cannot be predicted"
+                "the robot file states no masses (mass_kg, cog_mm): sag under the arm's own weight is identified where "
+                "the poses show it, but what another payload does to the arm cannot be predicted"
             )
         cameras = self._station(poses)
         if poses is None and entry.station is not None:
