@@ -7,12 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from robcal.estimation.reliability import critical_value, variance_factors, worst_marks
 from robcal.photogrammetry.bundle.adjustment import adjust
 from robcal.photogrammetry.bundle.covariance import cofactors, factorise
 from robcal.photogrammetry.bundle.normals import Linearised
 from robcal.photogrammetry.bundle.operator import problem_of
 from robcal.photogrammetry.bundle.settings import AdjustSettings
-from robcal.photogrammetry.bundle.snooping import critical_value, reliability, variance_factors, worst_marks
+from robcal.photogrammetry.bundle.snooping import reliability
 from robcal.photogrammetry.bundle.snooping import test_statistics as mark_statistics
 from robcal.photogrammetry.core.network import CameraNetwork, ImageMarks
 from robcal.transforms import Array
