@@ -12,7 +12,8 @@ from robcal.calibration.cell import with_fitted_cell
 from robcal.calibration.identifiability import weak_parameters
 from robcal.calibration.identification import IdentifiedRobot
 from robcal.calibration.joint_log import JointLog
-from robcal.calibration.measurements import RobotRecording, Rows
+from robcal.calibration.measurements import RobotRecording, Rows, evenly_weighted
+from robcal.calibration.observations import FrameObservations
 from robcal.diagnosis.core.fitting import Accepted, fit
 from robcal.diagnosis.core.recording import Recording
 from robcal.diagnosis.core.result import Diagnosis
@@ -171,7 +172,11 @@ def robot_in_force(
     if recording.observations_are_spatial:
         joint = noise.joint_sigma / np.sqrt(noise.factor)
         stated = log.as_stated().inputs(robot.kernel).subset(rows)
-        robot = replace(robot, model=with_fitted_cell(robot.kernel, stated, found.recording.select(rows), joint))
+        measured = found.recording.select(rows)
+        if recording.own_station:
+            joint = 0.0
+            measured = tuple(evenly_weighted(o) if isinstance(o, FrameObservations) else o for o in measured)
+        robot = replace(robot, model=with_fitted_cell(robot.kernel, stated, measured, joint))
     nominal = found.robot.nominal
     return (robot if nominal is None else robot.with_recording(log, nominal)), relative
 
