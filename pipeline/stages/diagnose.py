@@ -73,7 +73,7 @@ def _in_force(found: RobotDiagnosis) -> dict[str, Any]:
     return {
         "in_force": decided.diagnosed,
         "in_force_reason": decided.reason,
-        "delivered_mm": {"identified": decided.identified_mm, "diagnosed": decided.diagnosed_mm},
+        "delivered_mm": {"identified": 1e3 * decided.identified, "diagnosed": 1e3 * decided.diagnosed_error},
     }
 
 

@@ -2,65 +2,97 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from robcal.calibration.joint_log import JointLog
 from robcal.calibration.measurements import Rows
-from robcal.diagnosis.core.fitting import Fit
+from robcal.diagnosis.core.fitting import Accepted, Fit, fit
 from robcal.diagnosis.core.recording import Recording
-from robcal.diagnosis.gain.delivered import WAITING, blocked_folds, delivered_errors, gain_of
+from robcal.diagnosis.gain.delivered import WAITING, Gain, blocked_folds, delivered_errors, gain_of
+from robcal.robot.model import RobotModel
+
+
+@dataclass(frozen=True)
+class Form:
+    """A model with its free parameters, beside displacements of what was measured."""
+
+    model: RobotModel
+    free: Sequence[str]
+    direct: Sequence[Accepted] = ()
+
+    def fit(self, recording: Recording) -> Fit:
+        """Everything together fitted to a recording."""
+        return fit(self.model, recording, self.free, self.direct)
 
 
 @dataclass(frozen=True)
 class InForce:
-    """Whether the diagnosed robot is delivered.
+    """Whether anything that the diagnosis found is delivered.
 
     Attributes
     ----------
-    diagnosed : true: it is; false: the identified robot is.
-    identified_mm, diagnosed_mm : errors of both, RMS over blocked folds of the identification poses, predicted from
-        what the table of poses states.
+    form : of the robot that is delivered.
+    diagnosed : whether it differs from the identified robot's.
+    identified, diagnosed_error : errors (m) without and with everything that was found, RMS over blocked folds of the
+        identification poses, predicted from what the table of poses states.
     reason : in words.
     """
 
+    form: Form
     diagnosed: bool
-    identified_mm: float
-    diagnosed_mm: float
+    identified: float
+    diagnosed_error: float
     reason: str
 
 
-def choose(recording: Recording, log: JointLog, rows: Rows, identified: Fit, diagnosed: Fit) -> InForce:
-    """Compare two fits to the same recording by what they deliver over blocked folds.
+def choose(recording: Recording, log: JointLog, rows: Rows, bare: Form, extended: Form) -> InForce:
+    """Decide by what the robots deliver over blocked folds.
 
-    Terms that depend on approach directions which nobody stated wait for them: they are in force if they pay with the
-    directions inferred and cost nothing without.
+    First come faults of the measuring system: the robot is fitted beside them if the measurements agree with it clearly
+    better in every fold. Then terms of the robot, against measurements that are free of such faults. Terms that depend
+    on approach directions which nobody stated wait for them: they are in force if they pay with the directions inferred
+    and cost nothing without.
     """
     plain = replace(recording, common=None, shared=None)
     labels = blocked_folds(recording)
     fold = labels[recording.observations.pose]
-    logs = [log.as_stated(), log] if log.inferred else [log]
-    gains = []
-    for given in logs:
-        errors = [
-            delivered_errors(plain, f, given.inputs(f.kernel).subset(rows), labels) for f in (identified, diagnosed)
-        ]
-        gains.append(gain_of(errors[0], errors[1], fold))
-    stated, inferred = gains[0], gains[-1]
-    before, after = stated.before * 1e3, stated.after * 1e3
-    told = f"{before:.3g} mm without the terms, {after:.3g} mm with them"
-    if stated.pays:
-        return InForce(True, before, after, f"the error over blocked folds falls: {told}")
-    if inferred.pays and stated.even and after <= WAITING * before:
-        return InForce(
-            True,
-            before,
-            after,
-            f"the error falls where approach directions are stated: {1e3 * inferred.before:.3g} mm without the terms, "
-            f"{1e3 * inferred.after:.3g} mm with them; without directions {told}",
-        )
-    why = "grows" if after > before else "does not fall by more than its standard error"
-    if stated.before - stated.after > stated.sigma:
-        why = "grows much in a part of the poses"
-    return InForce(
-        False, before, after, f"the error over blocked folds {why}: {told}; the identified robot is delivered"
-    )
+
+    def gain(before: Form, after: Form, given: JointLog, freed: bool) -> Gain:
+        fits = [form.fit(plain) for form in (before, after)]
+        errors = [delivered_errors(plain, f, given.inputs(f.kernel).subset(rows), labels, freed=freed) for f in fits]
+        return gain_of(errors[0], errors[1], fold)
+
+    stated = log.as_stated()
+    whole = gain(bare, extended, stated, False)
+    chosen, reasons = bare, []
+    if extended.direct:
+        beside = replace(bare, direct=extended.direct)
+        found = gain(bare, beside, stated, True)
+        chosen = beside if found.clear else bare
+        reasons.append(_told("faults of the measuring", found, found.clear))
+    if extended.model.terms != bare.model.terms or set(extended.free) != set(bare.free):
+        full = replace(extended, direct=chosen.direct)
+        found = gain(chosen, full, stated, True)
+        pays = found.pays
+        reasons.append(_told("terms of the robot", found, pays))
+        if not pays and log.inferred and found.even and found.after <= WAITING * found.before:
+            known = gain(chosen, full, log, True)
+            pays = known.pays
+            if pays:
+                reasons[-1] = _told("terms of the robot, where approach directions are stated", known, True)
+        chosen = full if pays else chosen
+    reason = "; ".join(reasons) + ("" if chosen is not bare else "; the identified robot is delivered")
+    return InForce(chosen, chosen is not bare, whole.before, whole.after, reason)
+
+
+def _told(what: str, found: Gain, accepted: bool) -> str:
+    errors = f"{1e3 * found.before:.3g} mm without, {1e3 * found.after:.3g} mm with them"
+    if accepted:
+        return f"{what} pay: error over blocked folds {errors}"
+    why = "the error does not fall enough"
+    if found.after > found.before:
+        why = "the error grows"
+    elif not found.even:
+        why = "the error grows much in a part of the poses"
+    return f"{what} do not pay ({why} over blocked folds: {errors})"

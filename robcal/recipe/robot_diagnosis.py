@@ -30,9 +30,8 @@ from robcal.recipe.corrections import corrected
 from robcal.recipe.evidence import Evidence, evidence_of
 from robcal.recipe.identification import Identification
 from robcal.recipe.image_findings import ImageFindings
-from robcal.recipe.in_force import InForce, choose
+from robcal.recipe.in_force import Form, InForce, choose
 from robcal.recipe.recording import recording_for_diagnosis
-from robcal.robot.model import RobotModel
 from robcal.transforms import Array
 
 UNCORRECTED = frozenset({"refraction", "ellipse_eccentricity", "centroid_bias"})
@@ -64,7 +63,7 @@ class RobotDiagnosis:
     in_force : whether the robot with what was found is delivered, and why.
     robot : the robot in force.
     relative : (p, p) covariance of its parameters against frames of the own station; None without one.
-    corrected : the measurements without what was found in the measuring system; None where nothing was.
+    corrected : the measurements without the faults of the measuring system that the robot was fitted beside, if any.
     evidence : what every pose says of each cause.
     """
 
@@ -111,34 +110,27 @@ def diagnose_robot(
     clean = relabelled(recording, find_swaps(recording)) if swapped else recording
     kept = ~np.isin(np.array(clean.names), diagnosis.blunders)
     clean, rows = clean.subset(kept), found.rows[kept]
-    bare, extended = (robot.model, free, ()), (diagnosis.model, diagnosis.free, _displacements(diagnosis))
-    in_force = InForce(False, float("nan"), float("nan"), "nothing was found")
+    bare, extended = Form(robot.model, free), Form(diagnosis.model, diagnosis.free, _displacements(diagnosis))
+    in_force = InForce(bare, False, float("nan"), float("nan"), "nothing was found")
     if diagnosis.findings:
-        plain = replace(clean, common=None)
-        in_force = choose(plain, log, rows, *(fit(m, plain, names, direct) for m, names, direct in (bare, extended)))
+        in_force = choose(clean, log, rows, bare, extended)
     if not in_force.diagnosed:
         used = robot.used[kept]  # poses that the identification left out
         clean, rows = clean.subset(used), rows[used]
-    delivered, relative = robot_in_force(found, log, clean, rows, *(extended if in_force.diagnosed else bare))
+    delivered, relative = robot_in_force(found, log, clean, rows, in_force.form)
     return RobotDiagnosis(
         diagnosis=diagnosis,
         recording=recording,
         in_force=in_force,
         robot=delivered,
         relative=relative,
-        corrected=corrected(found.recording, log, diagnosis),
+        corrected=corrected(found.recording, log, diagnosis) if in_force.form.direct else None,
         evidence=evidence_of(robot.model, recording, free, verify, diagnosis),
     )
 
 
 def robot_in_force(
-    found: Identification,
-    log: JointLog,
-    recording: Recording,
-    rows: Rows,
-    model: RobotModel,
-    free: Sequence[str],
-    direct: Sequence[Accepted],
+    found: Identification, log: JointLog, recording: Recording, rows: Rows, form: Form
 ) -> tuple[CalibratedRobot, Array | None]:
     """All parameters and terms of a model once more together, with base and tool in the datum of the measurements.
 
@@ -148,18 +140,18 @@ def robot_in_force(
 
     Parameters
     ----------
-    recording, rows : the poses to fit to, and their rows in the joint log. direct : displacements of observations.
+    recording, rows : the poses to fit to, and their rows in the joint log.
 
     Returns
     -------
     The robot, and (p, p) the covariance of its parameters where errors common to all poses are known, None where there
     are none.
     """
-    noise = estimate_noise(model, recording, free, direct)
-    final = fit(model, noise.apply(recording), free, direct)
+    noise = estimate_noise(form.model, recording, form.free, form.direct)
+    final = form.fit(noise.apply(recording))
     p, relative = len(final.free), None
     if recording.own_station and final.common is not None:
-        known = fit(final.model, replace(noise.apply(recording), common=None), free, direct, iterations=0)
+        known = fit(final.model, replace(noise.apply(recording), common=None), form.free, form.direct, iterations=0)
         relative = known.covariance[:p, :p] * final.variance_factor
     robot = CalibratedRobot(
         model=with_folded_cell(final.model),

@@ -21,6 +21,8 @@ from robcal.robot.model import GEOMETRIC_KINDS
 
 MUCH_WORSE = 1.25
 """Factor by which the error in one fold may grow."""
+CLEAR, CLEAR_SIGMAS = 0.8, 3.0
+"""Factor to which the error has to fall, and standard errors, for a fault of the measuring to be beyond doubt."""
 WAITING = 1.01
 """Factor by which the error may grow where terms wait for approach directions that the user may state."""
 
@@ -33,13 +35,16 @@ def blocked_folds(recording: Recording) -> Array:
     return np.asarray(labels[first[groups]])
 
 
-def delivered_errors(recording: Recording, fitted: Fit, inputs: PoseInputs, labels: Array) -> Array:
+def delivered_errors(
+    recording: Recording, fitted: Fit, inputs: PoseInputs, labels: Array, *, freed: bool = False
+) -> Array:
     """Lengths (m_obs,) of the position errors, m, of each observation predicted from the other folds.
 
     Parameters
     ----------
     recording : as it was measured. fitted : a fit to it, errors common to all poses not taken off.
     inputs : the poses as they would be stated to predict. labels : fold of each pose (n,).
+    freed : whether the measurements count without the displacements that the fit holds for faults of the measuring.
     """
     kernel = fitted.kernel
     columns = np.array([kernel.index[name] for name in fitted.free], dtype=np.intp)
@@ -48,13 +53,18 @@ def delivered_errors(recording: Recording, fitted: Fit, inputs: PoseInputs, labe
     residual, jacobian = plain.linearise(frames, J)
     cell = [f"{end}.{kind}" for end in ("base", "tool") for kind in GEOMETRIC_KINDS]
     own = [k for k, name in enumerate(fitted.free) if name in cell]
+    displaced = fitted.jacobian[:, len(columns) :]
+    direct = [item.values for item in fitted.accepted if item.family.displace is not None]
+    amplitudes = np.concatenate(direct) if direct else np.zeros(0)
     fold_of_row = labels[fitted.row_pose]
     left = np.empty(len(residual))
     for fold in np.unique(labels):
         test = fold_of_row == fold
         rows = np.vstack([fitted.jacobian[~test], fitted.prior])
-        step = solve(rows, np.concatenate([fitted.residual[~test], fitted.prior_residual]))[: len(columns)]
-        after = residual - jacobian @ step
+        step = solve(rows, np.concatenate([fitted.residual[~test], fitted.prior_residual]))
+        after = residual - jacobian @ step[: len(columns)]
+        if freed:
+            after = after - displaced @ (amplitudes + step[len(columns) :])
         # base and tool are those of the measurements as they are
         left[test] = after[test] - jacobian[np.ix_(test, own)] @ solve(jacobian[np.ix_(~test, own)], after[~test])
     errors = plain.unwhiten(left[:, None], frames)[:, :3, 0]
@@ -75,6 +85,12 @@ class Gain:
     def pays(self) -> bool:
         """The error falls by more than its own standard error, and in no fold it grows much."""
         return self.before - self.after > self.sigma and self.even
+
+    @property
+    def clear(self) -> bool:
+        """The error falls much, far beyond its standard error, and in every fold."""
+        falls = self.after <= CLEAR * self.before and self.before - self.after > CLEAR_SIGMAS * self.sigma
+        return falls and bool(np.all(self.folds_after <= self.folds_before))
 
     @property
     def even(self) -> bool:
