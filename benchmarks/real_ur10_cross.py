@@ -146,17 +146,17 @@ def left(s: Linear, predicted: np.ndarray) -> np.ndarray:
 def pattern_of(series: Sequence[Linear], values: np.ndarray) -> tuple[Pattern, dict[int, float]]:
     """Which joints have the same curve, by the curves of the training series alone; and their correlations."""
     q = np.concatenate([s.q for s in series])
-    families = [periodic_curve(Joint(k, f"axis{k}", "z", 1, False), q[:, k - 1], BUMPS) for k in range(1, 7)]
-    parts = [Accepted(f, f.grid[0], v, np.zeros((0, 0))) for f, v in zip(families, values.reshape(6, -1), strict=True)]
-    sense, turn, joints, told = np.ones(6), np.zeros(6), [0], {}
+    causes = [periodic_curve(Joint(k, f"axis{k}", "z", 1, False), q[:, k - 1], BUMPS) for k in range(1, 7)]
+    parts = [Accepted(f, f.grid[0], v, np.zeros((0, 0))) for f, v in zip(causes, values.reshape(6, -1), strict=True)]
+    sense, turn, joints, reported = np.ones(6), np.zeros(6), [0], {}
     for like in likenesses(parts, list(q.T)):
         k, i = int(like.joint[4:]) - 1, int(like.other[4:]) - 1
         if i in joints:
             sense[k] = like.sense * sense[i]
             turn[k] = sense[i] * like.shift + turn[i]
             joints.append(k)
-            told[k] = like.correlation
-    return Pattern(tuple(joints), sense, turn), told
+            reported[k] = like.correlation
+    return Pattern(tuple(joints), sense, turn), reported
 
 
 @dataclass(frozen=True)
@@ -177,7 +177,7 @@ def trained(series: Sequence[Linear], names: Sequence[str]) -> Trained:
     robot = solve(series, [s.J for s in series], geometry)
     priors = np.concatenate([geometry, few, np.full(6 * BUMPS, CURVE_PRIOR)])
     curves = solve(series, [np.concatenate([s.J, slow(s), own_curves(s)], axis=2) for s in series], priors)
-    pattern, told = pattern_of(series, curves[len(names) + len(few) :])
+    pattern, reported = pattern_of(series, curves[len(names) + len(few) :])
     priors = np.concatenate([geometry, few, np.full(BUMPS, CURVE_PRIOR)])
     at = len(names) + len(few)
     shared = solve(series, [np.concatenate([s.J, slow(s), pattern.columns(s)], axis=2) for s in series], priors)
@@ -189,7 +189,7 @@ def trained(series: Sequence[Linear], names: Sequence[str]) -> Trained:
         shared, turn = step[: len(priors)], pattern.turn.copy()
         turn[list(pattern.joints[1:])] += step[len(priors) :]
         pattern = Pattern(pattern.joints, pattern.sense, turn)
-    return Trained(robot, curves, shared, pattern, told)
+    return Trained(robot, curves, shared, pattern, reported)
 
 
 def errors(found: Trained, s: Linear, nothing: np.ndarray) -> list[np.ndarray]:

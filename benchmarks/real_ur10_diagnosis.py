@@ -33,15 +33,15 @@ def recording(q: np.ndarray, T: np.ndarray, C: np.ndarray, rows: np.ndarray) -> 
     return Recording(q[rows], (None,) * len(rows), covariates, tuple(f"row {i}" for i in rows), frames), frames
 
 
-def normalised(told: Diagnosis, kept_out: Recording, measured: FrameObservations) -> tuple[float, float, float]:
+def normalised(reported: Diagnosis, kept_out: Recording, measured: FrameObservations) -> tuple[float, float, float]:
     """Normalised error without and with the scatter of the joints, and the median of the latter against its median."""
-    kernel = Kernel(told.model, "converged")
+    kernel = Kernel(reported.model, "converged")
     inputs = kept_out.inputs(kernel)
-    columns = np.array([kernel.index[name] for name in told.free])
+    columns = np.array([kernel.index[name] for name in reported.free])
     T, J = kernel.frames_and_jacobian(kernel.theta0, inputs, columns)
-    moved = told.joint_sigma * kernel.joint_jacobian(kernel.theta0, inputs)
+    moved = reported.joint_sigma * kernel.joint_jacobian(kernel.theta0, inputs)
     error = (tf.invert(T) @ measured.world_T_tool)[:, :3, 3]
-    known = J @ told.covariance @ J.swapaxes(1, 2) + measured.covariance * told.noise_estimated**2
+    known = J @ reported.covariance @ J.swapaxes(1, 2) + measured.covariance * reported.noise_estimated**2
     out = []
     for V in (known, known + moved @ moved.swapaxes(1, 2)):
         square = np.einsum("ni,nij,nj->n", error, np.linalg.inv(V[:, :3, :3]), error)
@@ -66,9 +66,9 @@ def main() -> None:
         found = identify(model, kernel.poses(train.q), [frames], kernel=kernel)
         tied = (*found.eliminated, *(n for n in found.rejected_elasticities if n in own))
         across = tuple(n for n in found.names if ".elastic_" in n and n not in own)
-        told = diagnose(found.model, train, found.names, tied, kept_out, optional=across)
+        reported = diagnose(found.model, train, found.names, tied, kept_out, optional=across)
         seconds = time.process_time() - clock
-        before, after, _ = (1e3 * v for v in told.heldout)
+        before, after, _ = (1e3 * v for v in reported.heldout)
         rows.append(
             [
                 series.upper(),
@@ -76,13 +76,13 @@ def main() -> None:
                 len(kept_out.q),
                 before,
                 after,
-                1e6 * told.joint_sigma,
-                *normalised(told, kept_out, measured),
+                1e6 * reported.joint_sigma,
+                *normalised(reported, kept_out, measured),
                 seconds,
             ]
         )
         print(f"Series {series.upper()}:")
-        for finding in told.findings:
+        for finding in reported.findings:
             mm = " -> ".join(f"{1e3 * v:.3f}" for v in finding.heldout)
             print(f"  {finding.statement}; kept-out error {mm} mm")
     table(

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field
 
+from pipeline.camera_import import foreign_camera, split_choice
 from pipeline.files import write_text
 from pipeline.robot_file import Placement, placement_data
 from pipeline.schemas import Entry, Number, Positive, read_entry, shown
@@ -18,6 +20,8 @@ from robcal.transforms import Array
 
 FORMAT = "robcal/camera-1"
 MAX_PIXELS = 100_000
+CORNER = 0.12
+"""A principal point nearer to the top-left corner (of the sides) is one counted from the middle."""
 
 
 def _side(value: Any) -> Any:
@@ -68,32 +72,49 @@ class CameraFile:
 
 
 def read_camera(path: Path | str) -> CameraFile:
-    """Read a camera file.
+    """Read a camera file, the project's own or one of OpenCV, ROS, Kalibr (``camchain.yaml#cam1``) or Metashape.
 
     Raises
     ------
-    InvalidInput : the file contradicts the contract or itself (principal point far outside the image).
+    InvalidInput : the file contradicts its format or itself (principal point far outside the image).
     """
-    entry, document = read_entry(Path(path), CameraEntry, FORMAT)
-    numbers = {name: getattr(entry, name) for name in INTRINSIC_NAMES}
-    for name, side in (("cx", entry.width), ("cy", entry.height)):
-        if not -side <= numbers[name] <= 2 * side:
-            raise InvalidInput(
-                f"{document.path}, line {document.line((name,))}: {name} = {numbers[name]:g} lies far outside the "
-                f"image of {entry.width} x {entry.height} px: it is in pixels, usually near the middle"
-            )
-    for name in ("fx", "fy"):
-        if numbers[name] < 0.05 * max(entry.width, entry.height):
-            raise InvalidInput(
-                f"{document.path}, line {document.line((name,))}: {name} = {numbers[name]:g} is too short for an image "
-                f"of {entry.width} x {entry.height} px: it is in pixels (focal length in mm divided by the pixel size)"
-            )
+    file, choice = split_choice(path)
+    foreign = foreign_camera(file, choice)
+    if foreign is not None:
+        _check(foreign, {name: str(file) for name in INTRINSIC_NAMES})
+        return CameraFile(foreign)
+    entry, document = read_entry(file, CameraEntry, FORMAT)
+    camera = Camera(entry.width, entry.height, **{name: getattr(entry, name) for name in INTRINSIC_NAMES})
+    _check(camera, {name: f"{file}, line {document.line((name,))}" for name in INTRINSIC_NAMES})
     return CameraFile(
-        camera=Camera(entry.width, entry.height, **numbers),
+        camera=camera,
         world_T_camera=entry.world_T_camera.matrix() if entry.world_T_camera else None,
         pixel_um=entry.pixel_um,
         sigmas=dict(entry.sigmas) or None,
     )
+
+
+def _check(camera: Camera, where: Mapping[str, str]) -> None:
+    """Refuse what is no interior orientation in pixels; ``where`` is the place of each number, for the message."""
+    size = f"an image of {camera.width} x {camera.height} px"
+    for name, side in (("cx", camera.width), ("cy", camera.height)):
+        value = getattr(camera, name)
+        if not -side <= value <= 2 * side:
+            raise InvalidInput(
+                f"{where[name]}: {name} = {value:g} lies far outside {size}: it is in pixels, usually near the middle"
+            )
+    if abs(camera.cx) < CORNER * camera.width and abs(camera.cy) < CORNER * camera.height:
+        x, y = camera.cx + (camera.width - 1) / 2, camera.cy + (camera.height - 1) / 2
+        raise InvalidInput(
+            f"{where['cx']}: the principal point ({camera.cx:g}, {camera.cy:g}) lies in the corner of {size}, as if "
+            f"counted from the middle: count it from the centre of the top-left pixel, then it is ({x:g}, {y:g})"
+        )
+    for name in ("fx", "fy"):
+        if getattr(camera, name) < 0.05 * max(camera.width, camera.height):
+            raise InvalidInput(
+                f"{where[name]}: {name} = {getattr(camera, name):g} is too short for {size}: it is in pixels (focal "
+                "length in mm divided by the pixel size)"
+            )
 
 
 def write_camera(path: Path | str, content: CameraFile, comment: str = "") -> None:

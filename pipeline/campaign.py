@@ -10,11 +10,12 @@ import numpy as np
 
 from pipeline.body_file import BodyFile, check_ring_codes, read_body
 from pipeline.camera_file import CameraFile, read_camera
+from pipeline.camera_import import split_choice
 from pipeline.campaign_schema import FORMAT, CampaignEntry, StationCameraEntry, SurveyEntry
 from pipeline.images import list_images
 from pipeline.measurement_tables import MarksTable, MeasuredTable, read_marks, read_measurements
 from pipeline.poses_table import Poses, read_poses
-from pipeline.robot_file import read_robot
+from pipeline.robot_import import read_any_robot
 from pipeline.schemas import parse, proposal
 from pipeline.yaml_io import YamlDocument, read_yaml
 from robcal.errors import InvalidInput
@@ -207,9 +208,10 @@ class _Reader:
                 raise self._error(place, f"there is no body '{key}' under 'bodies'{proposal(key, list(entry.bodies))}")
 
     def _robot(self) -> RobotModel | None:
-        if self.entry.robot is None:
+        use = self.entry.robot
+        if use is None:
             return None
-        robot = read_robot(self._file(self.entry.robot))
+        robot = read_any_robot(self._file(use.file), use.base_link, use.tip_link)
         loads = {name: load.payload() for name, load in self.entry.payloads.items()}
         own = sum(frame.mass for frame in robot.frames)
         for name, load in loads.items():
@@ -238,8 +240,10 @@ class _Reader:
     ) -> ImageSource:
         if (entry.images is None) == (entry.observations is None):
             raise self._error(place, f"{what} needs either 'images' (a folder) or 'observations' (a CSV file)")
-        start = read_camera(self._file(camera)) if camera is not None else None
-        start_path = self._place(camera) if camera is not None else None
+        start, start_path = None, None
+        if camera is not None:
+            start, start_path = read_camera(self._place(camera)), split_choice(self._place(camera))[0]
+            self.files.append(start_path)
         size = entry.size_px
         if start is not None:
             size = (start.camera.width, start.camera.height)

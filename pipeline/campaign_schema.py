@@ -116,12 +116,24 @@ class DiagnosisEntry(Entry):
     level: Annotated[float, Field(gt=0, lt=0.5)] = 0.01
 
 
+def _file_alone(value: Any) -> Any:
+    return {"file": value} if isinstance(value, str) else value
+
+
+class RobotUse(Entry):
+    """The nominal robot; the links choose a chain of a URDF."""
+
+    file: Text
+    base_link: Text | None = None
+    tip_link: Text | None = None
+
+
 class CampaignEntry(Entry):
     """The whole file."""
 
     format: Literal["robcal/campaign-1"]
     name: Annotated[str, BeforeValidator(_folder_name)]
-    robot: Text | None = None
+    robot: Annotated[RobotUse | None, BeforeValidator(_file_alone)] = None
     poses: Text | None = None
     payloads: dict[str, PayloadEntry] = Field(default_factory=dict)
     bodies: dict[str, BodyUse] = Field(default_factory=dict)

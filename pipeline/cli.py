@@ -16,8 +16,8 @@ from typing import Annotated, Any
 
 import typer
 
-from pipeline.messages import Messages
-from pipeline.runs import plain
+from pipeline.json_io import plain
+from pipeline.messages import LOG, show
 from robcal.errors import RobcalError
 
 app = typer.Typer(
@@ -37,9 +37,10 @@ CampaignPath = Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="Campaign
 
 
 @contextmanager
-def _answers(command: str, as_json: bool) -> Iterator[dict[str, Any]]:
+def _answers(command: str, as_json: bool, quiet: bool) -> Iterator[dict[str, Any]]:
     """Run a command's body; errors on purpose become one line and exit code 1, a mistake of the program too."""
     answer: dict[str, Any] = {}
+    show(quiet)
     try:
         yield answer
     except typer.Exit:
@@ -105,14 +106,13 @@ def run(
 
     Stages: detect, survey, orient, measure, frames, identify, diagnose, verify, report.
     """
-    with _answers("run", as_json) as answer:
+    with _answers("run", as_json, quiet) as answer:
         _check_stages(start, until)
         from pipeline.runner import run_campaign
 
-        messages = Messages(quiet)
-        done = run_campaign(campaign, out, until=until, start=start, messages=messages, workers=workers)
+        done = run_campaign(campaign, out, until=until, start=start, workers=workers)
         answer.update(_summary(done))
-        messages.info(f"results in {done.run.folder}")
+        LOG.info(f"results in {done.run.folder}")
 
 
 @app.command()
@@ -125,13 +125,12 @@ def survey(
     as_json: Json = False,
 ) -> None:
     """Only the bundle adjustment of the campaign's bodies."""
-    with _answers("survey", as_json) as answer:
+    with _answers("survey", as_json, quiet) as answer:
         from pipeline.commands import survey_campaign
 
-        messages = Messages(quiet)
-        done = survey_campaign(campaign, body, out, messages, workers)
+        done = survey_campaign(campaign, body, out, workers)
         answer.update(_summary(done))
-        messages.info(f"results in {done.run.folder}")
+        LOG.info(f"results in {done.run.folder}")
 
 
 @app.command(short_help="Only the diagnosis: what physics the model lacks.")
@@ -143,16 +142,15 @@ def diagnose(
     as_json: Json = False,
 ) -> None:
     """Say what physics the model lacks: only the diagnosis (also a stage of `run`)."""
-    with _answers("diagnose", as_json) as answer:
+    with _answers("diagnose", as_json, quiet) as answer:
         from pipeline.commands import diagnose_place
 
-        messages = Messages(quiet)
-        done, diagnosis = diagnose_place(place, out, messages, workers)
+        done, diagnosis = diagnose_place(place, out, workers)
         answer.update({"run": str(done.run.folder), "diagnosis": diagnosis})
         for cause in diagnosis.get("causes", []):
-            messages.info(str(cause.get("statement") or cause.get("cause")))
+            LOG.info(str(cause.get("statement") or cause.get("cause")))
         if not diagnosis.get("causes"):
-            messages.info("nothing missing: model and recordings agree within their noise")
+            LOG.info("nothing missing: model and recordings agree within their noise")
 
 
 @app.command(short_help="Where the calibrated robot's tool really is.")
@@ -167,14 +165,13 @@ def predict(
     as_json: Json = False,
 ) -> None:
     """Say where the calibrated robot's tool really is, in the measuring system's coordinates."""
-    with _answers("predict", as_json) as answer:
+    with _answers("predict", as_json, quiet) as answer:
         from pipeline.prediction import predict_run
 
         answer.update(predict_run(run_folder, poses, out, nominal=nominal))
-        messages = Messages(quiet)
         for sentence in answer["warnings"]:
-            messages.warn(sentence)
-        messages.info(f"{answer['poses']} frames in {out}")
+            LOG.warning(sentence)
+        LOG.info(f"{answer['poses']} frames in {out}")
 
 
 @app.command(short_help="Commands that bring the tool where it should be.")
@@ -203,7 +200,7 @@ def compensate(
         _wrong_use(f"--in is 'world' or 'base', not '{system}'")
     if program not in (None, "krl", "rapid", "urscript"):
         _wrong_use(f"--program is 'krl', 'rapid' or 'urscript', not '{program}'")
-    with _answers("compensate", as_json) as answer:
+    with _answers("compensate", as_json, quiet) as answer:
         from pipeline.prediction import compensate_run
 
         targets, in_base = kind == "frames", system == "base"
@@ -212,30 +209,29 @@ def compensate(
                 run_folder, frames, out, as_frames=targets, in_base=in_base, skip_unreachable=skip, program=program
             )
         )
-        messages = Messages(quiet)
         for sentence in answer["warnings"]:
-            messages.warn(sentence)
+            LOG.warning(sentence)
         if program == "rapid" and targets:
-            messages.warn(f"{out}: the tool data 'tool_robcal' hold the body's frame and 1 kg: put in the load")
+            LOG.warning(f"{out}: the tool data 'tool_robcal' hold the body's frame and 1 kg: put in the load")
         if program and targets and not in_base:
-            messages.warn(
+            LOG.warning(
                 f"{out}: its targets are in the measuring system's coordinates, not in the robot's base; "
                 "controllers want --in base"
             )
         remaining = answer["remaining_max_mm"]
         told = f"at most {remaining:.2g} mm" if remaining >= 1e-4 else "below 0.0001 mm"
-        messages.info(f"{answer['frames']} rows in {out}, remaining error {told}")
+        LOG.info(f"{answer['frames']} rows in {out}, remaining error {told}")
 
 
 @app.command()
 def report(run_folder: RunFolder, quiet: Quiet = False, as_json: Json = False) -> None:
     """Write the report again."""
-    with _answers("report", as_json) as answer:
+    with _answers("report", as_json, quiet) as answer:
         from pipeline.commands import report_again
 
         path = report_again(run_folder)
         answer["report"] = str(path)
-        Messages(quiet).info(str(path))
+        LOG.info(str(path))
 
 
 @app.command(short_help="Render a small campaign and run it.")
@@ -246,10 +242,10 @@ def demo(
     as_json: Json = False,
 ) -> None:
     """Render a small campaign and run it; the last line is the path of the report."""
-    with _answers("demo", as_json) as answer:
+    with _answers("demo", as_json, quiet) as answer:
         from pipeline.commands import run_demo
 
-        done = run_demo(out, Messages(quiet), workers)
+        done = run_demo(out, workers)
         answer.update(_summary(done))
         if not as_json:
             typer.echo(str(done.run.report))
@@ -263,14 +259,13 @@ def poses(
     as_json: Json = False,
 ) -> None:
     """Generate measuring poses: within limits, visible, free of collisions, as few as the wanted accuracy needs."""
-    with _answers("poses", as_json) as answer:
+    with _answers("poses", as_json, quiet) as answer:
         from pipeline.pose_generation import generate_poses
 
-        messages = Messages(quiet)
         answer.update(generate_poses(config, out))
         for sentence in answer["warnings"]:
-            messages.warn(sentence)
-        messages.info(f"{answer['poses']} poses in {out}")
+            LOG.warning(sentence)
+        LOG.info(f"{answer['poses']} poses in {out}")
 
 
 @app.command(short_help="C99 and URDF of the calibrated robot.")
@@ -284,13 +279,13 @@ def export(
     """Export the calibrated robot for controllers and simulators."""
     if c is None and urdf is None:
         _wrong_use("name what to write: --c FOLDER, --urdf FILE, or both")
-    with _answers("export", as_json) as answer:
+    with _answers("export", as_json, quiet) as answer:
         from pipeline.exports import export_run
 
         written = export_run(run_folder, c, urdf)
         answer["files"] = [str(path) for path in written]
         for path in written:
-            Messages(quiet).info(str(path))
+            LOG.info(str(path))
 
 
 def main() -> None:

@@ -8,14 +8,15 @@ from typing import Any
 
 from pipeline.campaign import read_campaign
 from pipeline.files import storage_error
-from pipeline.messages import Messages
+from pipeline.json_io import read_json
+from pipeline.messages import LOG
 from pipeline.runner import Done, run_campaign
-from pipeline.runs import campaign_of, is_run, open_run, read_json
+from pipeline.runs import campaign_of, is_run, open_run
 from pipeline.schemas import proposal
 from robcal.errors import InvalidInput
 
 
-def survey_campaign(path: Path, body: str | None, out: Path | None, messages: Messages, workers: int | None) -> Done:
+def survey_campaign(path: Path, body: str | None, out: Path | None, workers: int | None) -> Done:
     """Detect and adjust the survey of one body, or of all.
 
     Raises
@@ -29,12 +30,10 @@ def survey_campaign(path: Path, body: str | None, out: Path | None, messages: Me
     if not surveyed or (body is not None and body not in surveyed):
         what = f"body '{body}'" if body else "no body"
         raise InvalidInput(f"{campaign.path}: {what} has {'no ' if body else 'a '}survey: add 'survey' under the body")
-    return run_campaign(path, out, only=("detect", "survey"), messages=messages, workers=workers, body=body)
+    return run_campaign(path, out, only=("detect", "survey"), workers=workers, body=body)
 
 
-def diagnose_place(
-    place: Path, out: Path | None, messages: Messages, workers: int | None
-) -> tuple[Done, dict[str, Any]]:
+def diagnose_place(place: Path, out: Path | None, workers: int | None) -> tuple[Done, dict[str, Any]]:
     """The diagnosis of a campaign or of a finished run, and what has to come before it.
 
     Raises
@@ -48,7 +47,7 @@ def diagnose_place(
             raise InvalidInput(f"{place}: its campaign {campaign} is gone: the diagnosis needs the recordings")
     else:
         campaign = place
-    done = run_campaign(campaign, out, until="diagnose", messages=messages, workers=workers)
+    done = run_campaign(campaign, out, until="diagnose", workers=workers)
     if not done.run.diagnosis.is_file():
         raise InvalidInput(f"{campaign}: nothing to diagnose: the diagnosis is switched off in the campaign")
     return done, read_json(done.run.diagnosis)
@@ -63,13 +62,13 @@ def report_again(folder: Path) -> Path:
         return write_run_report(run)
 
 
-def run_demo(folder: Path, messages: Messages, workers: int | None) -> Done:
+def run_demo(folder: Path, workers: int | None) -> Done:
     """Render the demonstration campaign (unless it is there already) and run it."""
     from fixtures.demo import render_demo
 
     campaign = folder / "campaign"
     if not (campaign / "campaign.yaml").is_file():
-        messages.info(f"rendering a campaign in {folder} ...")
+        LOG.info("rendering a campaign in %s ...", folder)
         try:
             folder.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryDirectory(dir=folder, prefix=".rendering-") as scratch:
@@ -77,4 +76,4 @@ def run_demo(folder: Path, messages: Messages, workers: int | None) -> Done:
                 rendered.rename(campaign)  # complete or not there
         except OSError as error:
             raise storage_error(folder, error) from None
-    return run_campaign(campaign, folder / "run", messages=messages, workers=workers)
+    return run_campaign(campaign, folder / "run", workers=workers)

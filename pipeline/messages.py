@@ -1,64 +1,79 @@
-"""What people see while a run works: progress and warnings on standard error, everything in log.txt."""
+"""What people see while a run works: progress and warnings on standard error, everything in the run's log.txt.
+
+All of it goes through ``LOG``, the logger ``pipeline``: INFO is what is going on, WARNING what matters even when quiet,
+DEBUG what belongs into the file alone.
+"""
 
 from __future__ import annotations
 
-import datetime
+import logging
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeVar
-
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from pipeline.files import storage_error
 
 T = TypeVar("T")
 
+LOG = logging.getLogger("pipeline")
+LOG.setLevel(logging.DEBUG)
+LOG.addHandler(logging.NullHandler())
+_TERMINAL = "terminal"
 
-class Messages:
-    """Sink of messages.
 
-    Parameters
-    ----------
-    quiet : only warnings and errors on the terminal.
-    log : file that gets every line with its time; None for no file.
-    """
-
-    def __init__(self, quiet: bool = False, log: Path | None = None) -> None:
-        self.quiet = quiet
-        self.log = log
-        self.console = Console(stderr=True, highlight=False, soft_wrap=True)
-
-    def info(self, text: str) -> None:
-        """A line about what is going on."""
-        self.record(text)
-        if not self.quiet:
-            self.console.print(text, markup=False)
-
-    def warn(self, text: str) -> None:
-        """A line that matters even when quiet."""
-        self.record(f"warning: {text}")
-        self.console.print(f"warning: {text}", style="yellow", markup=False)
-
-    def record(self, text: str) -> None:
-        """A line for log.txt alone."""
-        if self.log is None:
-            return
-        stamp = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+class _LogFile(logging.FileHandler):
+    def handleError(self, record: logging.LogRecord) -> None:
+        """A full disk is told, not passed over."""
         try:
-            with self.log.open("a", encoding="utf-8", errors="backslashreplace") as stream:
-                stream.write("".join(f"{stamp} {line}\n" for line in text.splitlines() or [""]))
+            raise
         except OSError as error:
-            raise storage_error(self.log, error) from None
+            raise storage_error(Path(self.baseFilename), error) from None
 
-    def track(self, items: Iterable[T], total: int, label: str) -> Iterator[T]:
-        """Yield items while a progress bar moves (on a terminal, unless quiet)."""
-        if self.quiet or not self.console.is_terminal:
-            yield from items
-            return
-        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-        with Progress(*columns, console=self.console, transient=True) as progress:
-            task = progress.add_task(label, total=total)
-            for item in items:
-                yield item
-                progress.advance(task)
+
+@contextmanager
+def logged_to(path: Path) -> Iterator[None]:
+    """Append every message to a file, with its time."""
+    try:
+        handler = _LogFile(path, encoding="utf-8", errors="backslashreplace")
+    except OSError as error:
+        raise storage_error(path, error) from None
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s", "%Y-%m-%dT%H:%M:%S%z"))
+    LOG.addHandler(handler)
+    try:
+        yield
+    finally:
+        LOG.removeHandler(handler)
+        handler.close()
+
+
+def show(quiet: bool) -> None:
+    """Show messages on standard error; only warnings when quiet."""
+    from rich.console import Console, ConsoleRenderable
+    from rich.logging import RichHandler
+    from rich.text import Text
+
+    class Terminal(RichHandler):
+        def render_message(self, record: logging.LogRecord, message: str) -> ConsoleRenderable:
+            warning = record.levelno >= logging.WARNING
+            return Text(f"warning: {message}", style="yellow") if warning else Text(message)
+
+        def render(self, *, message_renderable: ConsoleRenderable, **_: object) -> ConsoleRenderable:
+            return message_renderable  # without rich's columns, which fold lines
+
+    for handler in [h for h in LOG.handlers if h.name == _TERMINAL]:
+        LOG.removeHandler(handler)
+    handler = Terminal(logging.WARNING if quiet else logging.INFO, Console(stderr=True, soft_wrap=True))
+    handler.name = _TERMINAL
+    LOG.addHandler(handler)
+
+
+def track(items: Iterable[T], total: int, label: str) -> Iterator[T]:
+    """Yield items while a progress bar moves, where messages are shown on a terminal."""
+    from rich.logging import RichHandler
+    from rich.progress import track as bar
+
+    shown = next((h for h in LOG.handlers if isinstance(h, RichHandler) and h.level <= logging.INFO), None)
+    if shown is None or not shown.console.is_terminal:
+        return iter(items)
+    return iter(bar(items, label, total, console=shown.console, transient=True))

@@ -13,7 +13,8 @@ from pipeline.bodies import body_from_file
 from pipeline.body_file import read_body
 from pipeline.camera_file import read_camera
 from pipeline.poses_table import joint_columns
-from pipeline.robot_file import PayloadEntry, PlacementEntry, read_robot
+from pipeline.robot_file import PayloadEntry, PlacementEntry
+from pipeline.robot_import import read_any_robot
 from pipeline.schemas import Entry, NotNegative, Number, Positive, Text, Triple, Whole, read_entry
 from pipeline.tables import write_table
 from robcal.calibration.collision import Ball, Box, Capsule, HalfSpace, Obstacle, link_capsules
@@ -182,7 +183,7 @@ def read_request(config: Path) -> PoseRequest:
     """
     entry, _ = read_entry(config, PosesEntry, FORMAT)
     folder = config.parent
-    model = read_robot(folder / entry.robot)
+    model = read_any_robot(folder / entry.robot)
     payloads = {**model.payloads, **{name: p.payload() for name, p in entry.payloads.items()}}
     model = RobotModel(
         model.name,

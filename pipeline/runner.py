@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import time
-import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,8 +12,9 @@ from typing import Any
 from pipeline.campaign import Campaign, all_sources, read_campaign
 from pipeline.codec import StaleCache
 from pipeline.files import storage_error
-from pipeline.messages import Messages
-from pipeline.runs import RUN_FORMAT, Run, StageRecord, fingerprint, read_json, run_file, write_json
+from pipeline.json_io import fingerprint, read_json, write_json
+from pipeline.messages import LOG, logged_to
+from pipeline.runs import RUN_FORMAT, Run, StageRecord, run_file
 from pipeline.schemas import proposal
 from pipeline.sources import code_version
 from pipeline.stages.base import Context, Outcome, Stage
@@ -57,7 +57,6 @@ def run_campaign(
     until: str | None = None,
     start: str | None = None,
     only: Sequence[str] | None = None,
-    messages: Messages | None = None,
     workers: int | None = None,
     body: str | None = None,
 ) -> Done:
@@ -78,23 +77,21 @@ def run_campaign(
             raise InvalidInput(f"there is no stage '{name}'{proposal(name, list(STAGE_NAMES))}")
     if until and start and STAGE_NAMES.index(until) < STAGE_NAMES.index(start):
         raise InvalidInput(f"stage '{until}' comes before '{start}': --until must not lie before --from")
-    messages = messages or Messages(quiet=True)
     campaign = read_campaign(path)
     run = Run(out or default_folder(campaign))
     _keep_inputs_apart(campaign, run)
-    with run.lock():
-        messages.log = run.log
-        messages.record(f"run of {campaign.path} in {run.folder}")
+    with run.lock(), logged_to(run.log):
+        LOG.debug("run of %s in %s", campaign.path, run.folder)
         check_joint_limits(campaign, run)
         moved = _adopt(run, campaign)
         if moved is not None:
-            messages.info(moved)
+            LOG.info(moved)
         run.load_hashes()
-        context = Context(campaign, run, messages, workers or processes(), body)
+        context = Context(campaign, run, workers or processes(), body)
         for note in campaign.notes:
-            messages.info(note)
+            LOG.info(note)
         for warning in campaign.warnings:
-            messages.warn(warning)
+            LOG.warning(warning)
         try:
             return _run_stages(context, until, start, only)
         finally:
@@ -143,7 +140,7 @@ def _adopt(run: Run, campaign: Campaign) -> str | None:
 
 
 def _run_stages(context: Context, until: str | None, start: str | None, only: Sequence[str] | None) -> Done:
-    campaign, run, messages = context.campaign, context.run, context.messages
+    campaign, run = context.campaign, context.run
     stages = [stage for stage in STAGES if stage.applies(campaign)]
     names = [stage.name for stage in stages]
     ran: list[str] = []
@@ -160,7 +157,7 @@ def _run_stages(context: Context, until: str | None, start: str | None, only: Se
         key = stage_key(stage, context, names)
         if not forced and run.up_to_date(stage.name, key):
             skipped.append(stage.name)
-            messages.info(f"{stage.name}: up to date")
+            LOG.info("%s: up to date", stage.name)
             continue
         before = run.record(stage.name)
         run.forget(stage.name)
@@ -174,31 +171,30 @@ def _run_stages(context: Context, until: str | None, start: str | None, only: Se
 
 
 def _run_stage(stage: Stage, key: str, context: Context) -> None:
-    run, messages = context.run, context.messages
-    messages.info(f"{stage.name}: ...")
+    LOG.info("%s: ...", stage.name)
     begin = time.perf_counter()
     try:
         outcome = stage.work(context)
     except StaleCache as error:
         raise InvalidInput(f"{error}") from None
     except RobcalError as error:
-        messages.record(f"stage {stage.name} failed: {error}")
+        LOG.debug("stage %s failed: %s", stage.name, error)
         raise
     except OSError as error:
-        messages.record(traceback.format_exc())
-        raise storage_error(Path(error.filename or run.folder), error) from None
+        LOG.debug("stage %s failed", stage.name, exc_info=True)
+        raise storage_error(Path(error.filename or context.run.folder), error) from None
     except MemoryError:
         raise InvalidInput(f"stage {stage.name}: not enough memory: use smaller images or fewer at once") from None
     except Exception as error:
-        messages.record(traceback.format_exc())
+        LOG.debug("stage %s failed", stage.name, exc_info=True)
         raise InternalError(
-            f"stage {stage.name}: internal error ({type(error).__name__}): the traceback is in {run.log}"
+            f"stage {stage.name}: internal error ({type(error).__name__}): the traceback is in {context.run.log}"
         ) from error
     seconds = time.perf_counter() - begin
-    finish(run, stage.name, key, outcome, seconds)
+    finish(context.run, stage.name, key, outcome, seconds)
     for note in outcome.notes:
-        messages.info(f"  {note}")
-    messages.info(f"{stage.name}: done in {seconds:.1f} s")
+        LOG.info("  %s", note)
+    LOG.info("%s: done in %.1f s", stage.name, seconds)
 
 
 def finish(run: Run, stage: str, key: str, outcome: Outcome, seconds: float) -> None:

@@ -6,7 +6,6 @@ the record is written last, so a run killed at any moment resumes with the stage
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -14,14 +13,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from pipeline import codec
-from pipeline.files import sha256_of, storage_error, write_text
-from robcal.errors import InvalidInput, RobcalError
+from filelock import FileLock, Timeout
 
-try:
-    import fcntl
-except ImportError:  # Windows has no flock; runs there are not guarded against one another
-    fcntl = None  # type: ignore[assignment]
+from pipeline import codec
+from pipeline.files import sha256_of, storage_error
+from pipeline.json_io import read_json, write_json
+from robcal.errors import InvalidInput, RobcalError
 
 RECORD_FORMAT = "robcal/stage-record-1"
 RUN_FORMAT = "robcal/run-1"
@@ -257,21 +254,20 @@ class Run:
         ------
         RunLocked : another process holds it.
         """
-        path = self.folder / ".lock"
+        lock = FileLock(self.folder / ".lock", timeout=0)
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            stream = path.open("a")
+            lock.acquire()
+        except Timeout:
+            raise RunLocked(
+                f"{self.folder}: another run works in this folder: wait for it, or choose another with --out"
+            ) from None
         except OSError as error:
             raise storage_error(self.folder, error) from None
-        with stream:
-            if fcntl is not None:
-                try:
-                    fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                except BlockingIOError:
-                    raise RunLocked(
-                        f"{self.folder}: another run works in this folder: wait for it, or choose another with --out"
-                    ) from None
+        try:
             yield
+        finally:
+            lock.release()
 
 
 def open_run(path: Path) -> Run:
@@ -306,50 +302,3 @@ def _plain(name: str) -> str:
     if not name or name in {".", ".."} or any(c in name for c in "/\\\0"):
         raise InvalidInput(f"'{name}' cannot be the name of a body or camera: it names a file, use letters and digits")
     return name
-
-
-def write_json(path: Path, data: Mapping[str, Any]) -> None:
-    """Write JSON atomically; numbers that are not finite become null."""
-    text = json.dumps(plain(data), indent=1, ensure_ascii=False, allow_nan=False)
-    if any("\ud800" <= c <= "\udfff" for c in text):  # a file name in another encoding: only escapes bring it back
-        text = json.dumps(plain(data), indent=1, allow_nan=False)
-    write_text(path, text + "\n")
-
-
-def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON object written by this program.
-
-    Raises
-    ------
-    InvalidInput : missing or damaged.
-    """
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InvalidInput(f"{path}: no such file: run the campaign first") from None
-    except (OSError, ValueError) as error:
-        raise InvalidInput(f"{path}: damaged ({error}): run the campaign again") from None
-    if not isinstance(data, dict):
-        raise InvalidInput(f"{path}: damaged: run the campaign again")
-    return data
-
-
-def plain(value: Any) -> Any:
-    """Data that JSON can hold: numpy scalars and arrays to numbers and lists, not finite numbers to None."""
-    if isinstance(value, Mapping):
-        return {str(k): plain(v) for k, v in value.items()}
-    if isinstance(value, list | tuple | set | frozenset):
-        return [plain(v) for v in value]
-    if hasattr(value, "tolist"):
-        return plain(value.tolist())
-    if isinstance(value, float):
-        return value if value == value and abs(value) != float("inf") else None
-    if isinstance(value, Path):
-        return str(value)
-    return value
-
-
-def fingerprint(*pieces: Any) -> str:
-    """Hash of plain data."""
-    text = json.dumps(plain(list(pieces)), sort_keys=True, default=str)
-    return hashlib.sha256(text.encode()).hexdigest()

@@ -66,7 +66,12 @@ def frame_from_xyzrpy(six: ArrayLike) -> Array:
 
 
 def xyzrpy_from_frame(a_T_b: ArrayLike) -> Array:
-    """Six numbers ``(..., 6)`` of frames ``(..., 4, 4)``; inverse of :func:`frame_from_xyzrpy`."""
+    """Six numbers ``(..., 6)`` of frames ``(..., 4, 4)``; inverse of :func:`frame_from_xyzrpy`.
+
+    >>> base_T_tool = frame_from_xyzrpy([0.1, 0.2, 0.3, 0.0, 0.0, 0.5])
+    >>> xyzrpy_from_frame(base_T_tool).round(9)
+    array([0.1, 0.2, 0.3, 0. , 0. , 0.5])
+    """
     T = np.asarray(a_T_b, dtype=float)
     return np.concatenate([T[..., :3, 3], rpy_from_rotation(T[..., :3, :3])], axis=-1)
 
@@ -79,7 +84,12 @@ def invert(a_T_b: ArrayLike) -> Array:
 
 
 def transform(a_T_b: ArrayLike, p_b: ArrayLike) -> Array:
-    """Points ``p_a = a_T_b p_b``; frames ``(..., 4, 4)`` and points ``(..., 3)`` broadcast against each other."""
+    """Points ``p_a = a_T_b p_b``; frames ``(..., 4, 4)`` and points ``(..., 3)`` broadcast against each other.
+
+    >>> world_T_base = frame_from_xyzrpy([1.0, 0.0, 0.0, 0.0, 0.0, np.pi / 2])
+    >>> transform(world_T_base, [0.5, 0.0, 0.2]).round(9)
+    array([1. , 0.5, 0.2])
+    """
     T = np.asarray(a_T_b, dtype=float)
     return np.einsum("...ij,...j->...i", T[..., :3, :3], np.asarray(p_b, dtype=float)) + T[..., :3, 3]
 

@@ -81,7 +81,7 @@ def library(folder: Path, tables: Mapping[str, Path]) -> Answer:
     from pipeline.stages.identify import options_of, require_robot
     from pipeline.stages.observations import build_recording
     from robcal.calibration.variance_components import identify_recording
-    from robcal.diagnosis.content import as_contract
+    from robcal.diagnosis.content import diagnosis_content
     from robcal.diagnosis.core.recording import Recording
     from robcal.diagnosis.diagnose import diagnose
     from robcal.recipe.robot_diagnosis import optional_parameters, own_elasticities
@@ -124,7 +124,7 @@ def library(folder: Path, tables: Mapping[str, Path]) -> Answer:
         optional=optional_parameters(found),
     )
     seconds = time.process_time() - start
-    return Answer(as_contract(result), _predicted(result.model, campaign, covariates, tables), seconds)
+    return Answer(diagnosis_content(result), _predicted(result.model, campaign, covariates, tables), seconds)
 
 
 def _predicted(

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from pipeline.runs import plain
+from pipeline.json_io import plain
 
 Grade = Literal["good", "care", "bad", "none"]
 

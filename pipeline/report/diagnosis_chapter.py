@@ -15,34 +15,13 @@ from pipeline.report.robot_plot import robot_figure
 from pipeline.report.style import AFTER, BEFORE, GREY, label, layout, number, percent, probability, rounded, to_sigma
 from robcal.calibration.observations import PointObservations
 from robcal.photogrammetry.core.camera import Camera
+from robcal.photogrammetry.station.contradictions import LENS_RADIAL
+from robcal.physics.library import words_of
 from robcal.transforms import Array
 
 LEVEL = 0.01
 LONGEST_FORMULA = 100
 LAWS = {"gaussian_process": "smooth law", "spline": "smooth law", "harmonic": "harmonics"}
-_NAMES = {
-    "joint_compliance": "elasticity about the joint's own axis",
-    "link_compliance": "elasticity across the joint's axis",
-    "stiffness_nonlinear": "stiffness that changes with load",
-    "lost_motion": "lost motion",
-    "zero_jump": "jump of a joint's zero",
-    "joint_eccentricity": "eccentricity of a joint's encoder or gear",
-    "gear_ripple": "ripple of a gear",
-    "transmission_ratio": "wrong transmission ratio",
-    "joint_coupling": "one joint drags another",
-    "axis_wobble": "wobble of an axis",
-    "counterbalance": "balancing torque",
-    "payload_mass": "mass of the load",
-    "payload_cog": "centre of gravity of the load",
-    "base_compliance": "base that gives way",
-    "base_tilt": "tilt of the base against gravity",
-    "thermal_growth": "thermal growth",
-    "thermal_zero_drift": "thermal drift of a joint's zero",
-    "lens_radial": "radial distortion of the lens",
-    "lens_tangential": "tangential distortion of the lens",
-    "lens_affinity": "affinity of the image",
-    "unknown": "unknown, described by an empirical term",
-}
 
 
 def diagnosis_chapter(material: Material) -> Chapter:
@@ -75,7 +54,7 @@ def short_statement(d: Mapping[str, Any], most: int = 3) -> str:
 
 def said(name: object) -> str:
     """A cause's name in words."""
-    return _NAMES.get(str(name), str(name).replace("_", " "))
+    return words_of(str(name))
 
 
 def _how_sure(d: Mapping[str, Any]) -> str:
@@ -182,7 +161,7 @@ def _plots(material: Material, causes: list[dict[str, Any]]) -> list[Block]:
 def _image_plots(material: Material, causes: list[dict[str, Any]]) -> list[Block]:
     """The lens' curve where radial distortion was found; what each gains where there are several."""
     blocks: list[Block] = []
-    lenses = {str(c.get("where")) for c in causes if c.get("cause") == "lens_radial"}
+    lenses = {str(c.get("where")) for c in causes if c.get("cause") == LENS_RADIAL.name}
     for name, (camera, covariance, marks) in _cameras(material).items():
         if name in lenses:
             blocks.append(lens_figure(f"camera {name}", camera, covariance, marks))

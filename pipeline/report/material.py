@@ -9,7 +9,8 @@ from typing import Any
 
 from pipeline.campaign import Campaign, read_campaign
 from pipeline.codec import StaleCache
-from pipeline.runs import Run, campaign_of, read_json, run_file
+from pipeline.json_io import read_json
+from pipeline.runs import Run, campaign_of, run_file
 from pipeline.stages.registry import STAGES
 from robcal.calibration.verification import Verification
 from robcal.errors import RobcalError

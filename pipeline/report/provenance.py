@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
+from pipeline.json_io import plain
 from pipeline.report.material import Material
-from pipeline.runs import plain
 from pipeline.sources import all_modules, code_version
 
 _LIBRARIES = ("numpy", "scipy", "casadi", "opencv-contrib-python-headless", "pycolmap")

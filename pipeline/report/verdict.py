@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 
 from pipeline.report.blocks import Grade, KeyFigure, Verdict
@@ -11,6 +14,7 @@ from pipeline.report.style import number, percent
 from pipeline.report.verification_chapter import error_table, noise_by_tool
 from robcal.calibration.observations import FrameObservations
 from robcal.calibration.verification import Verification
+from robcal.physics.library import kinds
 
 LEVEL = 0.01
 """Probability below which errors are called larger than predicted, or a rest unexplained."""
@@ -51,12 +55,17 @@ def told_diagnosis(material: Material) -> str:
     return text
 
 
+def not_named(diagnosis: Mapping[str, Any] | None) -> bool:
+    """Whether a cause has no name, but an empirical term."""
+    return any(not kinds()[cause["cause"]].named for cause in (diagnosis or {}).get("causes", []))
+
+
 def _robot(material: Material, v: Verification) -> Verdict:
     noise = noise_by_tool(material)
     after, before = v.tools["0"], v.nominal["0"] if v.nominal else None
     gain = before.mean / after.mean if before is not None and after.mean > 0 else float("nan")
     unexplained = ((material.diagnosis or {}).get("unexplained") or {}).get("p_value")
-    strange = any(c.get("cause") == "unknown" for c in (material.diagnosis or {}).get("causes", []))
+    strange = not_named(material.diagnosis)
     grade: Grade = "good"
     doubts = []
     if v.p_value < LEVEL and v.coverage_95 < 0.9:
@@ -223,7 +232,7 @@ def _measuring(material: Material) -> Verdict:
             parts.append("but the station's adjustment did not converge")
     diagnosis = material.diagnosis or {}
     left = (diagnosis.get("unexplained") or {}).get("p_value")
-    if (left is not None and left < LEVEL) or any(c.get("cause") == "unknown" for c in diagnosis.get("causes", [])):
+    if (left is not None and left < LEVEL) or not_named(diagnosis):
         grade = "care" if grade == "good" else grade
         parts.append("but the images show something that the camera model does not explain")
     word = {"good": "Good", "care": "Usable, with care", "bad": "Not usable"}.get(grade, "")

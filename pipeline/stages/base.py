@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.campaign import Campaign
-from pipeline.messages import Messages
 from pipeline.runs import Run
 
 
@@ -24,7 +23,6 @@ class Context:
 
     campaign: Campaign
     run: Run
-    messages: Messages
     workers: int = 1
     body: str | None = None
 

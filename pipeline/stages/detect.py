@@ -12,8 +12,10 @@ from pipeline.body_file import BodyFile
 from pipeline.campaign import Campaign, ImageSource
 from pipeline.campaign_schema import SurveyEntry
 from pipeline.images import read_image
+from pipeline.json_io import fingerprint
+from pipeline.messages import track
 from pipeline.parallel import in_processes
-from pipeline.runs import Run, fingerprint
+from pipeline.runs import Run
 from pipeline.sources import code_version
 from pipeline.stages.base import Context, Outcome, Stage
 from robcal.errors import InvalidInput, RobcalError
@@ -145,7 +147,7 @@ def work(context: Context) -> Outcome:
             key = fingerprint(content, codec.encode(settings, {}), version)[:32]
             jobs.append(_Job(source, name, path, str(run.detections(key)), key, settings))
     results = in_processes(_detect, jobs, context.workers)
-    entries = list(context.messages.track(results, len(jobs), "detecting targets"))
+    entries = list(track(results, len(jobs), "detecting targets"))
     _refuse_unreadable(entries)
     notes = [note for source, (images, _, _) in sources(campaign).items() for note in _check(source, images, entries)]
     index = DetectionIndex(tuple(entries))

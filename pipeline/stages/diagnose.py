@@ -9,11 +9,13 @@ from typing import Any
 from pipeline.adjusted_images import findings_of
 from pipeline.bodies import body_for_robot
 from pipeline.campaign import Campaign
-from pipeline.runs import Run, write_json
+from pipeline.json_io import write_json
+from pipeline.messages import LOG
+from pipeline.runs import Run
 from pipeline.stages.base import Context, Outcome, Stage, no_files
 from pipeline.stages.identify import load_identification
 from pipeline.tables import write_table
-from robcal.diagnosis.content import as_contract, with_images
+from robcal.diagnosis.content import diagnosis_content, with_images
 from robcal.diagnosis.core.result import Diagnosis
 from robcal.diagnosis.images.diagnosis import ImageFinding
 from robcal.diagnosis.search.selection import SelectionSettings
@@ -37,13 +39,11 @@ def work(context: Context) -> Outcome:
     station = _own_station(run)
     measured = Measured(body_for_robot(campaign, run), run.load("points") if run.has("points") else None, station)
     identification = load_identification(run)
-    found = diagnose_robot(
-        identification, campaign.poses, measured, images, settings_of(campaign), context.messages.info
-    )
+    found = diagnose_robot(identification, campaign.poses, measured, images, settings_of(campaign), LOG.info)
     if found is None:
         return Outcome(notes=["nothing to diagnose"])
     diagnosis = found.diagnosis
-    content = with_images(as_contract(diagnosis), images.findings, images.scans, images.noise)
+    content = with_images(diagnosis_content(diagnosis), images.findings, images.scans, images.noise)
     if station is not None and found.recording.own_station:
         content = with_station_moves(content, station.names, found.recording, diagnosis.model)
     content = content | _in_force(found)
@@ -98,13 +98,13 @@ def _columns(rows: Any) -> dict[str, list[object]]:
 
 
 def _named(findings: Sequence[ImageFinding]) -> list[dict[str, Any]]:
-    return [{"cause": f.cause, "where": f.where, "direction": f.direction} for f in findings]
+    return [{"cause": f.name, "where": f.where, "direction": f.direction} for f in findings]
 
 
 def _result(diagnosis: Diagnosis) -> dict[str, Any]:
     before, after, floor = (v * 1000 for v in diagnosis.heldout)
     causes: Sequence[dict[str, Any]] = [
-        {"cause": f.family.cause, "where": f.family.where, "direction": f.family.direction} for f in diagnosis.findings
+        {"cause": f.cause.name, "where": f.cause.where, "direction": f.cause.direction} for f in diagnosis.findings
     ]
     return {
         "mismatch": diagnosis.mismatch,

@@ -26,6 +26,10 @@ from robcal.robot.model import RobotModel
 NAME = "identify"
 
 
+SUFFIXES = {".csv", ".yaml", ".yml", ".urdf", ".xml"}
+"""Files of a campaign that this stage may depend on; all others are images."""
+
+
 def options_of(campaign: Campaign, stated: bool) -> IdentifyOptions:
     """Choices of the identification from campaign.yaml."""
     chosen = campaign.entry.model
@@ -141,8 +145,10 @@ STAGE = Stage(
     name=NAME,
     applies=lambda campaign: campaign.robot is not None and campaign.poses is not None,
     work=work,
-    inputs=lambda campaign: [p for p in campaign.files if p.suffix.lower() in {".csv", ".yaml", ".yml"}],
-    settings=lambda campaign: campaign.entry.model_dump(include={"model", "payloads", "measurements", "body"}),
+    inputs=lambda campaign: [
+        p for p in campaign.files if p.suffix.lower() in {".csv", ".yaml", ".yml", ".urdf", ".xml"}
+    ],
+    settings=lambda campaign: campaign.entry.model_dump(include={"robot", "model", "payloads", "measurements", "body"}),
     after=("survey", "measure", "frames"),
     module=__name__,
 )

@@ -200,7 +200,7 @@ def _result(orientation: StationOrientation, marks: Mapping[str, StationMarks]) 
         "rms_px": orientation.rms_px,
         "redundancy": orientation.redundancy_total,
         "rejected": len(orientation.rejected),
-        "evidence": [e.kind for e in orientation.evidence],
+        "evidence": [e.name for e in orientation.evidence],
         "converged": orientation.converged,
     }
 

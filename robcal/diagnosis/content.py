@@ -1,4 +1,4 @@
-"""A diagnosis in the contract's form (`robcal/diagnosis-1`): plain numbers, millimetres and degrees."""
+"""A diagnosis as the content of diagnosis.json (`robcal/diagnosis-1`): plain numbers, millimetres and degrees."""
 
 from __future__ import annotations
 
@@ -8,21 +8,19 @@ from collections.abc import Sequence
 from robcal.diagnosis.core.result import Diagnosis, Finding
 from robcal.diagnosis.images.diagnosis import ImageDiagnosis, ImageFinding
 from robcal.diagnosis.next_poses import poses_table
-
-OF_STATION = frozenset({"camera_moved", "scale_drift", "scale_error"})
-"""Causes of cameras that 3D points show only for the station as a whole."""
+from robcal.physics.library import kinds
 
 
-def as_contract(diagnosis: Diagnosis) -> dict[str, object]:
+def diagnosis_content(diagnosis: Diagnosis) -> dict[str, object]:
     """The content of diagnosis.json for a robot's recording."""
     first = diagnosis.findings[0] if diagnosis.findings else None
     location = (
         None
         if first is None
         else {
-            "stage": first.family.stage,
-            "where": first.family.where,
-            "direction": first.family.direction,
+            "stage": first.cause.stage,
+            "where": first.cause.where,
+            "direction": first.cause.direction,
             "poses": list(first.poses),
         }
     )
@@ -61,21 +59,21 @@ def as_contract(diagnosis: Diagnosis) -> dict[str, object]:
 
 
 def _cause(finding: Finding) -> dict[str, object]:
-    family = finding.family
+    cause = finding.cause
     return {
-        "cause": family.cause,
-        "stage": family.stage,
-        "where": family.where,
-        "direction": family.direction,
+        "cause": cause.name,
+        "stage": cause.stage,
+        "where": cause.where,
+        "direction": cause.direction,
         "parameters": {name: number(value) for name, value in finding.parameters.items()},
         "sigma": {name: number(value) for name, value in finding.sigma.items()},
         "p_value": number(finding.p_value),
         "log_evidence": number(finding.log_evidence),
         "indistinguishable_from": [
             {
-                "cause": rival.family.cause,
-                "where": rival.family.where,
-                "direction": rival.family.direction,
+                "cause": rival.cause.name,
+                "where": rival.cause.where,
+                "direction": rival.cause.direction,
                 "probability": number(rival.probability),
                 "overlap": number(rival.overlap),
             }
@@ -89,16 +87,16 @@ def _cause(finding: Finding) -> dict[str, object]:
 
 
 def image_cause(finding: ImageFinding) -> dict[str, object]:
-    """One cause found in images, in the contract's form."""
+    """One cause found in images, as in diagnosis.json."""
     return {
-        "cause": finding.cause,
+        "cause": finding.name,
         "stage": finding.stage,
         "where": finding.where,
         "direction": finding.direction,
         "parameters": {name: number(value) for name, value in finding.parameters.items()},
         "sigma": {name: number(value) for name, value in finding.sigma.items()},
         "p_value": number(finding.p_value),
-        "indistinguishable_from": [{"cause": cause, "where": where} for cause, where in finding.rivals],
+        "indistinguishable_from": [{"cause": kind.name, "where": where} for kind, where in finding.rivals],
         "heldout_px": {"before": number(finding.heldout_px[0]), "after": number(finding.heldout_px[1])},
         "statement": finding.statement,
     }
@@ -109,7 +107,7 @@ def with_images(
 ) -> dict[str, object]:
     """The content of diagnosis.json for images alone, or the robot's extended by what the images say first.
 
-    `findings` are in the order in which they were accepted; `scans` the last looks at each set of images; `noise` the
+    `findings` are in the order in which they were accepted; `scans` the last scans of each set of images; `noise` the
     factor by which the marks scatter more than stated.
     """
     causes = [image_cause(finding) for finding in findings]
@@ -165,9 +163,9 @@ def _not_among(findings: Sequence[ImageFinding], causes: list[object]) -> list[o
 
     def place(cause: str, where: str, parameters: object) -> tuple[str, frozenset[str]]:
         others = {str(parameters["with"])} if isinstance(parameters, dict) and "with" in parameters else set()
-        return cause, frozenset({"station" if cause in OF_STATION else where, *others})
+        return cause, frozenset({"station" if kinds()[cause].of_station else where, *others})
 
-    known = {place(f.cause, f.where, f.parameters) for f in findings}
+    known = {place(f.name, f.where, f.parameters) for f in findings}
     return [
         cause
         for cause in causes

@@ -9,7 +9,7 @@ import numpy as np
 from robcal.diagnosis.core.fitting import Fit
 from robcal.diagnosis.core.recording import Recording
 from robcal.diagnosis.core.result import Finding
-from robcal.physics.cause import Array, Constants, Family
+from robcal.physics.cause import Array, Constants, LinearCause, ObservationCause
 from robcal.robot.kernel import PoseInputs
 from robcal.robot.model import RobotModel
 
@@ -29,19 +29,19 @@ def separating_poses(
     everything measured and chosen so far, fail to reproduce there: the growth of the rival's non-centrality.
     Weakness: collisions and visibility are not checked here; the pose generator can be given these poses to check.
     """
-    rivals = [r for r in finding.rivals if r.family.displace is None]
-    if not rivals or finding.family.displace is not None:
+    rivals = [r for r in finding.rivals if not isinstance(r.cause, ObservationCause)]
+    if not rivals or isinstance(finding.cause, ObservationCause):
         return ()
     inputs = _candidates(fitted, recording, CANDIDATES, seed)
     here, there = _frame_columns(fitted, fitted.inputs), _frame_columns(fitted, inputs)
     free = [i for i, name in enumerate(fitted.kernel.names) if name in fitted.free]
-    own_here = here.effect(finding.family, finding.constants) @ finding.values
-    own_there = there.effect(finding.family, finding.constants) @ finding.values
+    own_here = here.effect(finding.cause, finding.constants) @ finding.values
+    own_there = there.effect(finding.cause, finding.constants) @ finding.values
     base_here, base_there = here.parameters[:, :, free], there.parameters[:, :, free]
     per_rival = [
         (
-            np.concatenate([base_here, here.effect(r.family, r.constants)], axis=2),
-            np.concatenate([base_there, there.effect(r.family, r.constants)], axis=2),
+            np.concatenate([base_here, here.effect(r.cause, r.constants)], axis=2),
+            np.concatenate([base_there, there.effect(r.cause, r.constants)], axis=2),
         )
         for r in rivals
     ]
@@ -80,13 +80,13 @@ class _frame_columns:
         self.parameters = kernel.frames_and_jacobian(fitted.theta, inputs)[1] * weight
         self._index = kernel.index
 
-    def effect(self, family: Family, constants: Constants) -> Array:
-        """Columns of one family."""
-        if family.frees:
-            return self.parameters[:, :, [self._index[name] for name in family.frees]]
-        names = family.names(constants)
+    def effect(self, cause: LinearCause, constants: Constants) -> Array:
+        """Columns of one cause."""
+        if cause.free_parameters:
+            return self.parameters[:, :, [self._index[name] for name in cause.free_parameters]]
+        names = cause.names(constants)
         out = np.zeros((*self.parameters.shape[:2], len(names)))
-        for basis in family.bases(constants) if family.bases is not None else ():
+        for basis in cause.laws(constants):
             law = np.broadcast_to(basis.value(self._variables), self._variables["index"].shape)
             out[:, :, names.index(basis.parameter)] += self._motion[f"{basis.frame}.{basis.kind}"] * law[:, None]
         return out

@@ -1,29 +1,29 @@
-"""What a physical cause is to the software: where it acts, its law, its parameters and how they are told.
+"""Causes whose law is linear in its parameters (amplitudes), at one place each, and the entries of the library.
 
-A `Family` is one cause at one place. Its law is linear in its parameters (amplitudes); constants that bend the law
-(an order, the pose of a jump, a torque scale, a time constant) come from a grid, and the continuous ones among them
-may be refined between the grid's values. Robot families act through the kernel: `bases` names expressions of the
-robot's variables that are added to a number of a frame. Observation families act on what was measured: `displace`
-gives the displacement of every observation per unit of each parameter.
+Constants that bend a law (an order, the pose of a jump, a torque scale, a time constant) come from a grid, and the
+continuous ones among them may be refined between the grid's values. Causes of the robot act through its kernel: `bases`
+names expressions of the robot's variables that are added to a number of a frame. Causes of observations displace what
+was measured: `observation_shift` gives the displacement of every observation per unit of each parameter.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from robcal.cause import Cause, Kind, describe
 from robcal.robot.terms import evaluate
 
 Array = NDArray[Any]
 """Real numbers, indices or masks: the diagnosis handles all three."""
 Constants = Mapping[str, float]
 Report = Callable[[Array, Constants], dict[str, object]]
-Key = tuple[str, str, str | None, tuple[str, ...]]
+Key = tuple[Kind, str, str | None, tuple[str, ...]]
 
 DEG = float(np.degrees(1.0))
 PER_KNM = DEG * 1e3
@@ -58,72 +58,8 @@ class Basis:
 
 
 @dataclass(frozen=True)
-class Family:
-    """One cause at one place.
-
-    Attributes
-    ----------
-    cause, stage, where, direction : as in the contract of names.
-    parameters : short names of the amplitudes, the order of the columns.
-    priors : typical size of each amplitude (SI), the standard deviation of its prior.
-    report : amplitudes (SI) and constants to the contract's parameters with their units.
-    sentence : template for people, filled with the reported parameters, `where` and `direction`.
-    grid : values of the constants to be tried.
-    continuous : constants that may be refined, with their bounds.
-    ordered : constants with a long list of values of which the grid holds a part; refined among the values nearby.
-    positive : prior probability that the amplitude is positive (one parameter only): things give way and grow, rarely
-        the reverse.
-    weight : prior weight of the whole family (a cause that may act at many places shares one weight among them).
-    bases : robot families: constants to the expressions.
-    frees : robot families: parameters the kernel has already, which the cause sets free (order of `parameters`).
-    beside : parameters of the kernel that are fitted anyway and told with the cause: reported name to kernel name and
-        factor to the reported unit.
-    through : parameter of the kernel by which the law multiplies its amplitudes, and the value that stands in the law:
-        amplitudes are told for the value that the parameter has in the end.
-    displace : observation families: (data, constants) to displacements (m, k, parameters), see `ObservationData`.
-    """
-
-    cause: str
-    stage: str
-    where: str
-    direction: str | None
-    parameters: tuple[str, ...]
-    priors: tuple[float, ...]
-    report: Report
-    sentence: str
-    grid: tuple[Constants, ...] = ({},)
-    continuous: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    ordered: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
-    positive: float = 0.5
-    weight: float = 1.0
-    bases: Callable[[Constants], tuple[Basis, ...]] | None = None
-    frees: tuple[str, ...] = ()
-    beside: Mapping[str, tuple[str, float]] = field(default_factory=dict)
-    through: tuple[str, float] | None = None
-    displace: Callable[[ObservationData, Constants], Array] | None = None
-    covariates: tuple[str, ...] = ()
-    default_prior: float = 1.5e-4
-
-    def names(self, constants: Constants) -> tuple[str, ...]:
-        """Amplitudes in column order; where their number depends on the constants they are read from the bases."""
-        if self.parameters or self.bases is None:
-            return self.parameters
-        return tuple(dict.fromkeys(basis.parameter for basis in self.bases(constants)))
-
-    def sizes(self, constants: Constants) -> Array:
-        """Typical amplitude of each column."""
-        return np.array(self.priors) if self.priors else np.full(len(self.names(constants)), self.default_prior)
-
-    @property
-    def key(self) -> Key:
-        """What makes the family one of its kind; an axis may be dragged along by several others, so a coupling's
-        driving axis belongs to it."""
-        return (self.cause, self.where, self.direction, self.covariates if self.cause == "joint_coupling" else ())
-
-
-@dataclass(frozen=True)
 class ObservationData:
-    """What observation families may need: one row per observation, in the order of the residuals.
+    """What causes of observations may need: one row per observation, in the order of the residuals.
 
     Attributes
     ----------
@@ -147,6 +83,111 @@ class ObservationData:
     variables: Mapping[str, Array]
 
 
+@dataclass(frozen=True)
+class LinearCause(Cause):
+    """One cause at one place, with a law.
+
+    Attributes
+    ----------
+    parameters : short names of the amplitudes, the order of the columns.
+    priors : typical size of each amplitude (SI), the standard deviation of its prior.
+    report : amplitudes (SI) and constants to the reported parameters with their units.
+    sentence : template for people in place of the kind's.
+    grid : values of the constants to be tried.
+    continuous : constants that may be refined, with their bounds.
+    ordered : constants with a long list of values of which the grid holds a part; refined among the values nearby.
+    positive : prior probability that the amplitude is positive (one parameter only): things deflect and grow, rarely
+        the reverse.
+    weight : prior weight (a kind that may act at many places shares one weight among them).
+    covariates : variables that the law follows.
+    default_prior : typical size of amplitudes whose number depends on the constants.
+    free_parameters : parameters the kernel has already, which the cause sets free (order of `parameters`).
+    jointly_fitted : parameters of the kernel that are fitted anyway and reported with the cause: reported name to
+        kernel name and factor to the reported unit.
+    scaled_by : parameter of the kernel by which the law multiplies its amplitudes, and the value that stands in the
+        law: amplitudes are reported for the value that the parameter has in the end.
+    """
+
+    parameters: tuple[str, ...]
+    priors: tuple[float, ...]
+    report: Report
+    sentence: str = ""
+    grid: tuple[Constants, ...] = ({},)
+    continuous: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    ordered: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    positive: float = 0.5
+    weight: float = 1.0
+    covariates: tuple[str, ...] = ()
+    default_prior: float = 1.5e-4
+    free_parameters: tuple[str, ...] = ()
+    jointly_fitted: Mapping[str, tuple[str, float]] = field(default_factory=dict)
+    scaled_by: tuple[str, float] | None = None
+
+    def laws(self, constants: Constants) -> tuple[Basis, ...]:
+        """Expressions that are added to numbers of the robot's frames; none unless it is a cause of the robot."""
+        return ()
+
+    def names(self, constants: Constants) -> tuple[str, ...]:
+        """Amplitudes in column order."""
+        return self.parameters
+
+    def sizes(self, constants: Constants) -> Array:
+        """Typical amplitude of each column."""
+        return np.array(self.priors) if self.priors else np.full(len(self.names(constants)), self.default_prior)
+
+    def describe(self, reported: Mapping[str, object]) -> str:
+        """The sentence for reported parameters."""
+        return describe(self.sentence or self.kind.sentence, self.where, self.direction, reported)
+
+    @property
+    def key(self) -> Key:
+        """What makes the cause one of its kind; an axis may be dragged along by several others, so a coupling's
+        driving axis belongs to it."""
+        return (self.kind, self.where, self.direction, self.covariates if self.kind.several_drivers else ())
+
+    @property
+    def acts_once(self) -> bool:
+        """Whether a place has such a cause at most once: its constants bend one law (a threshold, a torque scale, a
+        time constant), while jumps at several poses and waves of several orders may add up."""
+        return len(self.grid) == 1 or bool(self.continuous) or "threshold_Nm" in self.ordered
+
+
+@dataclass(frozen=True)
+class RobotCause(LinearCause):
+    """A cause that changes the robot: `bases` gives the expressions that are added to numbers of frames."""
+
+    bases: Callable[[Constants], tuple[Basis, ...]] | None = None
+
+    def laws(self, constants: Constants) -> tuple[Basis, ...]:
+        """Expressions that are added to numbers of frames."""
+        return () if self.bases is None else self.bases(constants)
+
+    def names(self, constants: Constants) -> tuple[str, ...]:
+        """Amplitudes in column order; where their number depends on the constants they are read from the laws."""
+        return self.parameters or tuple(dict.fromkeys(basis.parameter for basis in self.laws(constants)))
+
+
+@dataclass(frozen=True)
+class ObservationCause(LinearCause):
+    """A cause that displaces observations: (data, constants) to displacements (m, k, parameters)."""
+
+    observation_shift: Callable[[ObservationData, Constants], Array] = field(kw_only=True)
+
+
+@dataclass(frozen=True)
+class Entry:
+    """An entry of the library: causes and the places where they may act.
+
+    Attributes
+    ----------
+    on_robot : a robot's site to the causes that may act there.
+    on_observations : observations, ids of the body's targets and its name to the causes that may show in them.
+    """
+
+    on_robot: Callable[[Any], Iterable[RobotCause]] | None = None
+    on_observations: Callable[[ObservationData, tuple[int, ...], str], Iterable[ObservationCause]] | None = None
+
+
 def numeric_sigma(
     report: Report, values: Array, constants: Constants, covariance: Array
 ) -> tuple[dict[str, object], dict[str, object]]:
@@ -155,9 +196,9 @@ def numeric_sigma(
     Text and constants are passed through without a sigma. Weakness: an amplitude near zero has a skew distribution
     that a standard deviation does not tell.
     """
-    told = report(values, constants)
-    numbers = [name for name, value in told.items() if isinstance(value, (float, list)) and name not in constants]
-    flat = {name: np.atleast_1d(np.asarray(told[name], dtype=float)) for name in numbers}
+    reported = report(values, constants)
+    numbers = [name for name, value in reported.items() if isinstance(value, (float, list)) and name not in constants]
+    flat = {name: np.atleast_1d(np.asarray(reported[name], dtype=float)) for name in numbers}
     spread = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
     slopes: dict[str, list[Array]] = {name: [] for name in numbers}
     for k, size in enumerate(spread):
@@ -175,7 +216,7 @@ def numeric_sigma(
         deviations = np.sqrt(np.clip(np.einsum("ij,jk,ik->i", jacobian, covariance, jacobian), 0.0, None))
         sigma[name] = (
             float(deviations[0])
-            if len(flat[name]) == 1 and not isinstance(told[name], list)
+            if len(flat[name]) == 1 and not isinstance(reported[name], list)
             else [float(v) for v in deviations]
         )
-    return told, sigma
+    return reported, sigma

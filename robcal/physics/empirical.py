@@ -1,6 +1,6 @@
 """Empirical terms for what the library has no name for: smooth bumps, harmonics and products in covariates.
 
-Each is a family like the named causes, with the cause `unknown`, and competes with them by evidence. Its parameters
+Each is a cause like the named causes, with the cause `unknown`, and competes with them by evidence. Its parameters
 are the coefficients of radial bumps over the covariate; their common prior makes it a coarse Gaussian process.
 """
 
@@ -11,14 +11,17 @@ from dataclasses import replace
 
 import numpy as np
 
-from robcal.physics.cause import Array, Basis, Constants, Family
+from robcal.cause import Kind
+from robcal.physics.cause import Array, Basis, Constants, RobotCause
 from robcal.physics.site import LETTER_OF_KIND, Joint, RobotSite
 from robcal.robot.terms import identifier
+
+UNKNOWN = Kind("unknown", "robot", "unknown, described by an empirical term", named=False)
 
 BUMPS = (4, 7, 12)
 """Numbers of bumps over the range of a covariate: three lengths over which it may vary."""
 EMPIRICAL_WEIGHT = 0.5
-"""Prior weight of all empirical families together, against one for each named cause: the library holds most."""
+"""Prior weight of all empirical causes together, against one for each named cause: the library holds most."""
 
 LEAST_IN_BUMP = 3
 """Poses within `REACH` widths of the centre of a bump that stands alone."""
@@ -29,9 +32,9 @@ CURVE_PRIOR = 3e-4
 """Typical amplitude of one bump of a joint's error curve, rad."""
 
 
-def empirical_families(site: RobotSite) -> Iterator[Family]:
+def empirical_causes(site: RobotSite) -> Iterator[RobotCause]:
     """Smooth laws in the joint's own angle, other angles, its torque, time, temperature and order; and products."""
-    families: list[Family] = []
+    causes: list[RobotCause] = []
     joints = [joint for joint in site.joints if site.varies(f"q{joint.number}", 1e-6)]
     for joint in joints:
         kinds = ("q", *joint.cross_angles) if not joint.prismatic else ("q",)
@@ -44,11 +47,11 @@ def empirical_families(site: RobotSite) -> Iterator[Family]:
             covariates += ["time_s"] * (kind == "q") + list(site.temperatures() if kind == "q" else ())
             for covariate in covariates:
                 if site.varies(covariate, 1e-6):
-                    families.append(_smooth(site, joint, kind, covariate))
-        families.extend(_product(joint, first, second) for i, first in enumerate(joints) for second in joints[i + 1 :])
-        families.extend(bump for bump in [_bump(site, joint)] if bump.grid)
-        families.extend(_taut(site, joint, other) for other in joints if other.number != joint.number)
-    yield from (replace(family, weight=EMPIRICAL_WEIGHT / len(families)) for family in families)
+                    causes.append(_smooth(site, joint, kind, covariate))
+        causes.extend(_product(joint, first, second) for i, first in enumerate(joints) for second in joints[i + 1 :])
+        causes.extend(bump for bump in [_bump(site, joint)] if bump.grid)
+        causes.extend(_taut(site, joint, other) for other in joints if other.number != joint.number)
+    yield from (replace(cause, weight=EMPIRICAL_WEIGHT / len(causes)) for cause in causes)
 
 
 def _place(joint: Joint, kind: str) -> str:
@@ -64,7 +67,7 @@ def _formula(bases: tuple[Basis, ...], values: Array) -> str:
     return " + ".join(f"{value:.6g}*({b.expression})" for b, value in zip(bases, values, strict=True))
 
 
-def spoken(covariate: str) -> str:
+def describe_covariate(covariate: str) -> str:
     """A covariate in words."""
     if covariate in ("time_s", "index"):
         return "time" if covariate == "time_s" else "the order of the poses"
@@ -78,7 +81,7 @@ def spoken(covariate: str) -> str:
     return f"the moment about {LETTER_OF_KIND[angle]} of {frame}" if angle in LETTER_OF_KIND else covariate
 
 
-def _smooth(site: RobotSite, joint: Joint, kind: str, covariate: str) -> Family:
+def _smooth(site: RobotSite, joint: Joint, kind: str, covariate: str) -> RobotCause:
     """A smooth law of a covariate; beyond the values recorded it stays as at their end."""
     values = site.variables[covariate]
     low, high = float(np.min(values)), float(np.max(values))
@@ -102,22 +105,21 @@ def _smooth(site: RobotSite, joint: Joint, kind: str, covariate: str) -> Family:
         return {"term": _term([covariate], "gaussian_process", _formula(bases(c), v))}
 
     # number of parameters changes with the grid, so each number of bumps is a grid point of its own width
-    return Family(
-        "unknown",
-        "robot",
+    return RobotCause(
+        UNKNOWN,
         joint.where,
         _place(joint, kind),
         (),
         (),
         report,
-        "Something the library has no name for acts on {where} and follows " + spoken(covariate),
+        "Something the library has no name for acts on {where} and follows " + describe_covariate(covariate),
         grid=tuple({"bumps": float(n)} for n in BUMPS),
         bases=bases,
         covariates=(covariate,),
     )
 
 
-def _product(joint: Joint, first: Joint, second: Joint) -> Family:
+def _product(joint: Joint, first: Joint, second: Joint) -> RobotCause:
     a, b = f"q{first.number}", f"q{second.number}"
 
     def bases(c: Constants) -> tuple[Basis, ...]:
@@ -127,22 +129,22 @@ def _product(joint: Joint, first: Joint, second: Joint) -> Family:
             laws.append(f"{a}*{b}")
         return tuple(Basis(joint.frame, "q", law, f"c{i}", c) for i, law in enumerate(laws))
 
-    return Family(
-        "unknown",
-        "robot",
+    return RobotCause(
+        UNKNOWN,
         joint.where,
         _place(joint, "q"),
         (),
         (),
         lambda v, c: {"term": _term([a, b], "harmonic", _formula(bases(c), v))},
-        f"Something the library has no name for acts on {{where}} and follows {spoken(a)} together with {spoken(b)}",
+        f"Something the library has no name for acts on {{where}} and follows {describe_covariate(a)} together with "
+        f"{describe_covariate(b)}",
         grid=tuple({"first_order": n, "second_order": m} for n in (1.0, 2.0) for m in (1.0, 2.0)),
         bases=bases,
         covariates=(a, b),
     )
 
 
-def _bump(site: RobotSite, joint: Joint) -> Family:
+def _bump(site: RobotSite, joint: Joint) -> RobotCause:
     k = joint.number
     values = site.variables[f"q{k}"]
     low, high = float(np.min(values)), float(np.max(values))
@@ -159,9 +161,8 @@ def _bump(site: RobotSite, joint: Joint) -> Family:
     def bases(c: Constants) -> tuple[Basis, ...]:
         return (Basis(joint.frame, "q", f"exp(-0.5*((q{k} - centre)/width)**2)", "c0", c),)
 
-    return Family(
-        "unknown",
-        "robot",
+    return RobotCause(
+        UNKNOWN,
         joint.where,
         _place(joint, "q"),
         (),
@@ -175,7 +176,7 @@ def _bump(site: RobotSite, joint: Joint) -> Family:
     )
 
 
-def _taut(site: RobotSite, joint: Joint, other: Joint) -> Family:
+def _taut(site: RobotSite, joint: Joint, other: Joint) -> RobotCause:
     """Nothing until another joint has gone so far to either side, then a pull that grows: hoses and cables."""
     name = f"q{other.number}"
     values = site.variables[name]
@@ -190,9 +191,8 @@ def _taut(site: RobotSite, joint: Joint, other: Joint) -> Family:
             Basis(joint.frame, "q", f"maximum(0.0, below - {held})", "c1", ends),
         )
 
-    return Family(
-        "unknown",
-        "robot",
+    return RobotCause(
+        UNKNOWN,
         joint.where,
         _place(joint, "q"),
         (),
@@ -206,7 +206,7 @@ def _taut(site: RobotSite, joint: Joint, other: Joint) -> Family:
     )
 
 
-def periodic_curve(joint: Joint, angles: Array, bumps: int) -> Family:
+def periodic_curve(joint: Joint, angles: Array, bumps: int) -> RobotCause:
     """An irregular error of a joint that repeats every turn: bumps all round the circle; angles (n,) as recorded, rad.
 
     The bumps are von Mises' (exp(cos)), so a joint at -90 deg and at 270 deg has the same error. Where the joint never
@@ -223,9 +223,8 @@ def periodic_curve(joint: Joint, angles: Array, bumps: int) -> Family:
             for i, x in enumerate(centres)
         )
 
-    return Family(
-        "unknown",
-        "robot",
+    return RobotCause(
+        UNKNOWN,
         joint.where,
         _place(joint, "q"),
         (),

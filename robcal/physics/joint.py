@@ -7,10 +7,65 @@ from dataclasses import replace
 
 import numpy as np
 
-from robcal.physics.cause import PER_KNM, Array, Basis, Constants, Family
+from robcal.cause import Kind
+from robcal.physics.cause import PER_KNM, Array, Basis, Constants, Entry, RobotCause
 from robcal.physics.prior_scale import LEAST_MOMENT
-from robcal.physics.site import LETTER_OF_KIND, Joint, RobotSite, breaks, exponential_law
+from robcal.physics.site import LETTER_OF_KIND, Joint, RobotSite, breaks, each_joint, evenly, exponential_law
 from robcal.robot.terms import identifier
+
+STIFFNESS_NONLINEAR = Kind(
+    "stiffness_nonlinear",
+    "robot",
+    "stiffness that changes with load",
+    "The gear of {where} stiffens or softens with load: cubic term {cubic_deg_per_kNm3:.3g} deg/kNm^3",
+)
+BACKLASH = Kind("backlash", "robot", "backlash")
+HYSTERESIS = Kind("hysteresis", "robot", "hysteresis")
+LOST_MOTION = Kind(
+    "lost_motion",
+    "robot",
+    "lost motion",
+    "{where} loses {amplitude_deg:.4f} deg around zero load (lost motion, scale {torque_Nm:.3g} N m)",
+)
+ZERO_JUMP = Kind("zero_jump", "robot", "jump of a joint's zero", of_order=True)
+JOINT_ECCENTRICITY = Kind(
+    "joint_eccentricity",
+    "robot",
+    "eccentricity of a joint's encoder or gear",
+    "The encoder or gear of {where} runs out of centre: {amplitude_deg:.4f} deg, order {order}",
+)
+GEAR_RIPPLE = Kind(
+    "gear_ripple",
+    "robot",
+    "ripple of a gear",
+    "The gear of {where} ripples {order:g} times a turn with {amplitude_deg:.4f} deg",
+)
+TRANSMISSION_RATIO = Kind(
+    "transmission_ratio",
+    "robot",
+    "wrong transmission ratio",
+    "The transmission of {where} turns {ratio_error_ppm:.0f} ppm more than its ratio says",
+)
+JOINT_COMPLIANCE = Kind(
+    "joint_compliance",
+    "robot",
+    "elasticity about the joint's own axis",
+    "{where} gives way about its own axis by {compliance_deg_per_kNm:.3g} deg/kNm, which the model leaves out",
+)
+JOINT_COUPLING = Kind(
+    "joint_coupling",
+    "robot",
+    "one joint drags another",
+    "{where} is dragged along by {from}: {ratio:.2e} of its angle",
+    several_drivers=True,
+)
+COUNTERBALANCE = Kind(
+    "counterbalance",
+    "robot",
+    "balancing torque",
+    "A balancing torque of {torque_Nm:.0f} N m acts on {where} that the model does not know",
+)
+THERMAL_ZERO_DRIFT = Kind("thermal_zero_drift", "robot", "thermal drift of a joint's zero")
 
 TORQUE_SCALES = (0.02, 0.06, 0.2, 0.5, 1.2)
 """Scales of a lost motion that are tried first, in shares of the largest load torque: joints are built for theirs."""
@@ -25,47 +80,37 @@ from deviations of a few mrad, whose sign friction hides."""
 HIGHEST_RIPPLE_ORDER = 180
 
 
-def joint_families(site: RobotSite) -> Iterator[Family]:
-    """All families of causes about the joints' own axes."""
-    joints = [joint for joint in site.joints if site.varies(f"q{joint.number}", 1e-6)]
-    makers = (_stiffness, _backlash, _hysteresis, _lost_motion, _zero_jump, _eccentricity, _ripple, _ratio, _zero_drift)
-    for maker in makers:
-        families = [family for joint in joints for family in maker(site, joint)]
-        yield from (_share(family, len(joints)) for family in families)
-    couplings = [f for joint in joints for f in _coupling(joint, joints)]
-    yield from (_share(family, len(couplings)) for family in couplings)
-    yield from _counterbalance(site, joints)
-
-
-def _share(family: Family, places: int) -> Family:
-    return replace(family, weight=family.weight / max(places, 1))
-
-
 def _amplitude_phase(values: Array, factor: float) -> tuple[float, float]:
     return float(np.hypot(*values) * factor), float(np.degrees(np.arctan2(values[1], values[0])))
 
 
-def _stiffness(site: RobotSite, joint: Joint) -> Iterator[Family]:
+def _compliance(site: RobotSite, joint: Joint) -> Iterator[RobotCause]:
+    k = joint.number
+    if joint.prismatic or not site.varies(f"torque{k}", LEAST_MOMENT):
+        return
+    elastic = f"{joint.frame}.elastic_{joint.own_angle}"
+    torque = f"torque{k}"
+    if elastic not in site.fitted:
+        yield RobotCause(
+            JOINT_COMPLIANCE,
+            joint.where,
+            LETTER_OF_KIND[joint.own_angle],
+            (elastic,),
+            (site.compliance(torque, 3e-6),),
+            lambda v, c: {"compliance_deg_per_kNm": float(v[0]) * PER_KNM},
+            positive=0.98,
+            weight=KNOWN_TO_GIVE,
+            free_parameters=(elastic,),
+        )
+
+
+def _stiffness(site: RobotSite, joint: Joint) -> Iterator[RobotCause]:
     k = joint.number
     if joint.prismatic or not site.varies(f"torque{k}", LEAST_MOMENT):
         return
     elastic = f"{joint.frame}.elastic_{joint.own_angle}"
     torque = f"torque{k}"
     linear_fitted = elastic in site.fitted
-    if not linear_fitted:
-        yield Family(
-            "joint_compliance",
-            "robot",
-            joint.where,
-            LETTER_OF_KIND[joint.own_angle],
-            (elastic,),
-            (site.compliance(torque, 3e-6),),
-            lambda v, c: {"compliance_deg_per_kNm": float(v[0]) * PER_KNM},
-            "{where} gives way about its own axis by {compliance_deg_per_kNm:.3g} deg/kNm, which the model leaves out",
-            positive=0.98,
-            weight=KNOWN_TO_GIVE,
-            frees=(elastic,),
-        )
     held = float(site.model.parameters.get(elastic, 0.0))
     largest = float(np.max(np.abs(site.variables[torque])))
     cubic = Basis(joint.frame, "q", f"{torque}*{torque}*{torque}", "cubic")
@@ -75,17 +120,15 @@ def _stiffness(site: RobotSite, joint: Joint) -> Iterator[Family]:
         told: dict[str, object] = {} if linear_fitted else {"linear_deg_per_kNm": (held + float(v[1])) * PER_KNM}
         return told | {"cubic_deg_per_kNm3": float(v[0] * np.degrees(1.0) * 1e9)}
 
-    yield Family(
-        "stiffness_nonlinear",
-        "robot",
+    yield RobotCause(
+        STIFFNESS_NONLINEAR,
         joint.where,
         LETTER_OF_KIND[joint.own_angle],
         ("cubic",) if linear_fitted else ("cubic", "linear"),
         (2e-4 / largest**3,) if linear_fitted else (2e-4 / largest**3, 3e-6),
         report,
-        "The gear of {where} stiffens or softens with load: cubic term {cubic_deg_per_kNm3:.3g} deg/kNm^3",
         bases=(lambda c: (cubic,)) if linear_fitted else (lambda c: (cubic, linear)),
-        beside={"linear_deg_per_kNm": (elastic, PER_KNM)} if linear_fitted else {},
+        jointly_fitted={"linear_deg_per_kNm": (elastic, PER_KNM)} if linear_fitted else {},
         covariates=(torque,),
     )
 
@@ -94,7 +137,7 @@ def _lag(joint: Joint) -> float:
     return 2e-4 if not joint.prismatic else 1e-4
 
 
-def _backlash(site: RobotSite, joint: Joint) -> Iterator[Family]:
+def _backlash(site: RobotSite, joint: Joint) -> Iterator[RobotCause]:
     k = joint.number
     torque = site.variables[f"torque{k}"]
     moved = site.varies(f"approach{k}")
@@ -121,9 +164,8 @@ def _backlash(site: RobotSite, joint: Joint) -> Iterator[Family]:
         told: dict[str, object] = {name: float(v[0]) * joint.factor}
         return told | {"threshold_Nm": c["threshold_Nm"]} if c.get("threshold_Nm") else told
 
-    yield Family(
-        "backlash",
-        "robot",
+    yield RobotCause(
+        BACKLASH,
         joint.where,
         LETTER_OF_KIND[joint.own_angle],
         ("width",),
@@ -156,14 +198,13 @@ def _thresholds(torque: Array) -> tuple[float, ...]:
     return tuple(float(between[i]) for i in chosen)
 
 
-def _hysteresis(site: RobotSite, joint: Joint) -> Iterator[Family]:
+def _hysteresis(site: RobotSite, joint: Joint) -> Iterator[RobotCause]:
     k = joint.number
     if not site.varies(f"approach{k}"):
         return
     name = f"width_{joint.unit}"
-    yield Family(
-        "hysteresis",
-        "robot",
+    yield RobotCause(
+        HYSTERESIS,
         joint.where,
         LETTER_OF_KIND[joint.own_angle],
         ("width",),
@@ -176,21 +217,19 @@ def _hysteresis(site: RobotSite, joint: Joint) -> Iterator[Family]:
     )
 
 
-def _lost_motion(site: RobotSite, joint: Joint) -> Iterator[Family]:
+def _lost_motion(site: RobotSite, joint: Joint) -> Iterator[RobotCause]:
     k = joint.number
     torque = site.variables[f"torque{k}"]
     largest = float(np.max(np.abs(torque)))
     if joint.prismatic or not site.varies(f"torque{k}", LEAST_MOMENT):
         return
-    yield Family(
-        "lost_motion",
-        "robot",
+    yield RobotCause(
+        LOST_MOTION,
         joint.where,
         LETTER_OF_KIND[joint.own_angle],
         ("amplitude",),
         (2e-4,),
         lambda v, c: {"amplitude_deg": float(v[0]) * np.degrees(1.0), "torque_Nm": c["torque_Nm"]},
-        "{where} loses {amplitude_deg:.4f} deg around zero load (lost motion, scale {torque_Nm:.3g} N m)",
         grid=tuple({"torque_Nm": share * largest} for share in TORQUE_SCALES),
         continuous={"torque_Nm": (0.003 * largest, 2.0 * largest)},
         positive=0.7,
@@ -199,12 +238,11 @@ def _lost_motion(site: RobotSite, joint: Joint) -> Iterator[Family]:
     )
 
 
-def _zero_jump(site: RobotSite, joint: Joint) -> Iterator[Family]:
+def _zero_jump(site: RobotSite, joint: Joint) -> Iterator[RobotCause]:
     first, every = breaks(site.variables["index"], 2)
     name = f"jump_{joint.unit}"
-    yield Family(
-        "zero_jump",
-        "robot",
+    yield RobotCause(
+        ZERO_JUMP,
         joint.where,
         LETTER_OF_KIND[joint.own_angle],
         ("jump",),
@@ -225,7 +263,7 @@ def _harmonic(k: int, frame: str, kind: str, order: float) -> tuple[Basis, Basis
     )
 
 
-def _eccentricity(site: RobotSite, joint: Joint) -> Iterator[Family]:
+def _eccentricity(site: RobotSite, joint: Joint) -> Iterator[RobotCause]:
     if joint.prismatic:
         return
 
@@ -233,22 +271,20 @@ def _eccentricity(site: RobotSite, joint: Joint) -> Iterator[Family]:
         amplitude, phase = _amplitude_phase(v, np.degrees(1.0))
         return {"order": int(c["order"]), "amplitude_deg": amplitude, "phase_deg": phase}
 
-    yield Family(
-        "joint_eccentricity",
-        "robot",
+    yield RobotCause(
+        JOINT_ECCENTRICITY,
         joint.where,
         LETTER_OF_KIND[joint.own_angle],
         ("cosine", "sine"),
         (3e-4, 3e-4),
         report,
-        "The encoder or gear of {where} runs out of centre: {amplitude_deg:.4f} deg, order {order}",
         grid=({"order": 1.0}, {"order": 2.0}),
         bases=lambda c: _harmonic(joint.number, joint.frame, "q", c["order"]),
         covariates=(f"q{joint.number}",),
     )
 
 
-def _ripple(site: RobotSite, joint: Joint) -> Iterator[Family]:
+def _ripple(site: RobotSite, joint: Joint) -> Iterator[RobotCause]:
     if joint.prismatic:
         return
 
@@ -258,66 +294,60 @@ def _ripple(site: RobotSite, joint: Joint) -> Iterator[Family]:
         order = nearest if abs(c["order"] - nearest) < 1e-6 else c["order"]
         return {"order": order, "amplitude_deg": amplitude, "phase_deg": phase}
 
-    yield Family(
-        "gear_ripple",
-        "robot",
+    yield RobotCause(
+        GEAR_RIPPLE,
         joint.where,
         LETTER_OF_KIND[joint.own_angle],
         ("cosine", "sine"),
         (1e-4, 1e-4),
         report,
-        "The gear of {where} ripples {order:g} times a turn with {amplitude_deg:.4f} deg",
         grid=tuple({"order": float(o)} for o in range(3, HIGHEST_RIPPLE_ORDER + 1)),
         bases=lambda c: _harmonic(joint.number, joint.frame, "q", c["order"]),
         covariates=(f"q{joint.number}",),
     )
 
 
-def _ratio(site: RobotSite, joint: Joint) -> Iterator[Family]:
+def _ratio(site: RobotSite, joint: Joint) -> Iterator[RobotCause]:
     k = joint.number
-    yield Family(
-        "transmission_ratio",
-        "robot",
+    yield RobotCause(
+        TRANSMISSION_RATIO,
         joint.where,
         LETTER_OF_KIND[joint.own_angle],
         ("ratio",),
         (2e-4,),
         lambda v, c: {"ratio_error_ppm": float(v[0]) * 1e6},
-        "The transmission of {where} turns {ratio_error_ppm:.0f} ppm more than its ratio says",
         bases=lambda c: (Basis(joint.frame, "q", f"q{k}", "ratio"),),
         covariates=(f"q{k}",),
     )
 
 
-def _coupling(joint: Joint, joints: list[Joint]) -> Iterator[Family]:
-    for driver in joints:
-        if driver.number == joint.number or driver.prismatic != joint.prismatic:
-            continue
+def _coupling(site: RobotSite) -> Iterator[RobotCause]:
+    joints = site.moving_joints
+    pairs = [(a, b) for a in joints for b in joints if a.number != b.number and a.prismatic == b.prismatic]
+    for joint, driver in pairs:
 
-        def bases(c: Constants, j: int = driver.number) -> tuple[Basis, ...]:
-            return (Basis(joint.frame, "q", f"q{j}", "ratio"),)
+        def bases(c: Constants, frame: str = joint.frame, j: int = driver.number) -> tuple[Basis, ...]:
+            return (Basis(frame, "q", f"q{j}", "ratio"),)
 
         def report(v: Array, c: Constants, where: str = driver.where) -> dict[str, object]:
             return {"from": where, "ratio": float(v[0])}
 
-        yield Family(
-            "joint_coupling",
-            "robot",
+        yield RobotCause(
+            JOINT_COUPLING,
             joint.where,
             LETTER_OF_KIND[joint.own_angle],
             ("ratio",),
             (3e-4,),
             report,
-            "{where} is dragged along by {from}: {ratio:.2e} of its angle",
             bases=bases,
             covariates=(f"q{driver.number}",),
         )
 
 
-def _counterbalance(site: RobotSite, joints: list[Joint]) -> Iterator[Family]:
+def _counterbalance(site: RobotSite) -> Iterator[RobotCause]:
     """Shows through the joint's own compliance only, so it equals an eccentricity of the first order."""
     loaded = []
-    for joint in joints:
+    for joint in site.moving_joints:
         elastic = float(site.model.parameters.get(f"{joint.frame}.elastic_{joint.own_angle}", 0.0))
         if not joint.prismatic and elastic > 1e-8:
             loaded.append((float(np.max(np.abs(site.variables[f"torque{joint.number}"]))), elastic, joint))
@@ -333,18 +363,15 @@ def _counterbalance(site: RobotSite, joints: list[Joint]) -> Iterator[Family]:
             return tuple(replace(wave, template=f"{elastic!r}*{wave.template}") for wave in waves)
 
         size = max(0.2 * largest, 1.0)
-        yield Family(
-            "counterbalance",
-            "robot",
+        yield RobotCause(
+            COUNTERBALANCE,
             joint.where,
             LETTER_OF_KIND[joint.own_angle],
             ("cosine", "sine"),
             (size, size),
             report,
-            "A balancing torque of {torque_Nm:.0f} N m acts on {where} that the model does not know",
-            # balancing cylinders and springs hang at the joint with the largest torque
             bases=bases,
-            through=(f"{joint.frame}.elastic_{joint.own_angle}", elastic),
+            scaled_by=(f"{joint.frame}.elastic_{joint.own_angle}", elastic),
             covariates=(f"q{joint.number}",),
             weight=0.7 if rank == 0 else 0.3 / (len(loaded) - 1),
         )
@@ -354,16 +381,15 @@ def _warming(frame: str, kind: str, law: tuple[str, dict[str, float]], parameter
     return Basis(frame, kind, law[0], parameter, law[1])
 
 
-def _zero_drift(site: RobotSite, joint: Joint) -> Iterator[Family]:
+def _zero_drift(site: RobotSite, joint: Joint) -> Iterator[RobotCause]:
     for name in site.temperatures():
         first = float(site.variables[name][int(np.argmin(site.variables["index"]))])
 
         def bases(c: Constants, law: str = f"({name} - {first!r})") -> tuple[Basis, ...]:
             return (Basis(joint.frame, "q", law, "drift"),)
 
-        yield Family(
-            "thermal_zero_drift",
-            "robot",
+        yield RobotCause(
+            THERMAL_ZERO_DRIFT,
             joint.where,
             LETTER_OF_KIND[joint.own_angle],
             ("drift",),
@@ -377,9 +403,8 @@ def _zero_drift(site: RobotSite, joint: Joint) -> Iterator[Family]:
     duration = site.duration_h()
     if duration > 0:
         start = float(np.min(site.variables["time_s"]))
-        yield Family(
-            "thermal_zero_drift",
-            "robot",
+        yield RobotCause(
+            THERMAL_ZERO_DRIFT,
             joint.where,
             LETTER_OF_KIND[joint.own_angle],
             ("drift",),
@@ -392,3 +417,19 @@ def _zero_drift(site: RobotSite, joint: Joint) -> Iterator[Family]:
             covariates=("time_s",),
             weight=0.5,
         )
+
+
+ENTRIES = (
+    Entry(on_robot=each_joint(_compliance)),
+    Entry(on_robot=each_joint(_stiffness)),
+    Entry(on_robot=each_joint(_backlash)),
+    Entry(on_robot=each_joint(_hysteresis)),
+    Entry(on_robot=each_joint(_lost_motion)),
+    Entry(on_robot=each_joint(_zero_jump)),
+    Entry(on_robot=each_joint(_eccentricity)),
+    Entry(on_robot=each_joint(_ripple)),
+    Entry(on_robot=each_joint(_ratio)),
+    Entry(on_robot=each_joint(_zero_drift)),
+    Entry(on_robot=evenly(_coupling)),
+    Entry(on_robot=_counterbalance),
+)

@@ -7,15 +7,47 @@ twist of the frame (translation first) for frames, metres along the wire for dis
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
 
-from robcal.physics.cause import DEG, Array, Constants, Family, ObservationData
-from robcal.physics.refraction import refraction_families
+from robcal.cause import Kind
+from robcal.photogrammetry.station.contradictions import CAMERA_MOVED, TARGET_SHIFTED, TARGET_SWAPPED
+from robcal.physics.cause import DEG, Array, Constants, Entry, ObservationCause, ObservationData
+from robcal.physics.refraction import refraction_causes
 from robcal.physics.site import breaks
+
+SCALE_ERROR = Kind(
+    "scale_error", "camera", "scale error", "The station measures lengths {ppm:.0f} ppm too long", of_station=True
+)
+SENSOR_SCALE = Kind("sensor_scale", "sensor", "sensor scale", "The sensor measures {ppm:.0f} ppm too long")
+SENSOR_ROTATION = Kind("sensor_rotation", "sensor", "sensor rotation", "The sensor's axes are turned by {deg} deg")
+SCALE_DRIFT = Kind("scale_drift", "camera", "drift of the scale", of_station=True)
+WIRE_SAG = Kind("wire_sag", "wire", "sag of the wire", "The wire sags as one of {g_per_m:.1f} g/m does")
+WIRE_STRETCH = Kind(
+    "wire_stretch", "wire", "stretch of the wire", "The wire stretches by {ppm_per_m:.0f} ppm per metre drawn"
+)
+WIRE_SCALE = Kind("wire_scale", "wire", "scale of the wire", "The wire encoder counts {ppm:.0f} ppm too much")
+WIRE_OFFSET = Kind("wire_offset", "wire", "zero of the wire", "The wire's zero is off by {mm:.2f} mm")
+PULLEY_WRAP = Kind(
+    "pulley_wrap",
+    "wire",
+    "wire around its pulley",
+    "The wire wraps around a pulley of {radius_mm:.1f} mm radius that the model leaves out",
+)
+BODY_THERMAL_GROWTH = Kind(
+    "body_thermal_growth",
+    "body",
+    "body thermal growth",
+    "The measuring body {where} grows by {um_per_m_K:.1f} um per metre and kelvin",
+)
+SPHERE_GROWTH = Kind(
+    "sphere_growth",
+    "sensor",
+    "sphere growth",
+    "The calibration sphere grows by {um_per_m_K:.1f} um per metre and kelvin",
+)
 
 STEEL_WIRE_N = 5.0
 """Tension that a draw-wire encoder typically keeps up (makers' data sheets: 2 to 10 N); sag scales with its inverse."""
@@ -23,8 +55,8 @@ GRAVITY = 9.80665
 Course = Callable[[ObservationData], Array]
 
 
-def measuring_families(data: ObservationData, ids: tuple[int, ...], body: str) -> Iterator[Family]:
-    """Families for the kind of observation at hand; `ids` are the targets of the body, `body` its name."""
+def measuring_causes(data: ObservationData, ids: tuple[int, ...], body: str) -> Iterator[ObservationCause]:
+    """Causes for the kind of observation at hand; `ids` are the targets of the body, `body` its name."""
     if data.kind in ("points", "frames"):
         yield from _station(data)
     if data.kind == "points":
@@ -75,17 +107,15 @@ def _positions(data: ObservationData) -> Array:
     return data.p_world if data.kind == "points" else data.world_T_tool[:, :3, 3]
 
 
-def _station(data: ObservationData) -> Iterator[Family]:
-    scale = Family(
-        "scale_error",
-        "camera",
+def _station(data: ObservationData) -> Iterator[ObservationCause]:
+    scale = ObservationCause(
+        SCALE_ERROR,
         "station",
         None,
         ("scale",),
         (1e-4,),
         lambda v, c: {"ppm": float(v[0]) * 1e6},
-        "The station measures lengths {ppm:.0f} ppm too long",
-        displace=lambda d, c: _world(d, _positions(d)[:, :, None]),
+        observation_shift=lambda d, c: _world(d, _positions(d)[:, :, None]),
     )
     if data.kind == "points" and len(np.unique(data.target)) >= 2:
         yield scale  # with frames alone the lengths of the robot absorb it
@@ -96,11 +126,11 @@ def _station(data: ObservationData) -> Iterator[Family]:
 
         yield replace(
             scale,
-            cause="scale_drift",
+            kind=SCALE_DRIFT,
             priors=(2e-5,),
             report=lambda v, c: {"ppm_per_K": float(v[0]) * 1e6},
             sentence="The scale of the station drifts by {ppm_per_K:.1f} ppm per kelvin",
-            displace=drift,
+            observation_shift=drift,
             covariates=(name,),
             weight=0.5,
         )
@@ -109,7 +139,7 @@ def _station(data: ObservationData) -> Iterator[Family]:
         duration, course = clock
         yield replace(
             scale,
-            cause="scale_drift",
+            kind=SCALE_DRIFT,
             priors=(1e-4 / duration,),
             covariates=("time_s",),
             weight=0.5,
@@ -117,10 +147,10 @@ def _station(data: ObservationData) -> Iterator[Family]:
             sentence="The scale of the station drifts by {ppm_per_h:.1f} ppm per hour",
             grid=tuple({"tau_h": share * duration} for share in (0.1, 0.25, 0.6, 3.0)),
             continuous={"tau_h": (0.02 * duration, 10.0 * duration)},
-            displace=lambda d, c: _world(d, _positions(d)[:, :, None] * course(d, c["tau_h"])),
+            observation_shift=lambda d, c: _world(d, _positions(d)[:, :, None] * course(d, c["tau_h"])),
         )
     if data.kind == "points":
-        yield from refraction_families(data)
+        yield from refraction_causes(data)
     first, every = breaks(data.variables["index"], 3)
 
     def moved(d: ObservationData, c: Constants) -> Array:
@@ -131,9 +161,8 @@ def _station(data: ObservationData) -> Iterator[Family]:
         shift = np.concatenate([turn, _cross_columns(arm)], axis=2)
         return _world(d, shift * after, np.concatenate([np.zeros_like(turn), turn], axis=2) * after)
 
-    yield Family(
-        "camera_moved",
-        "camera",
+    yield ObservationCause(
+        CAMERA_MOVED,
         "station",
         None,
         ("x", "y", "z", "rx", "ry", "rz"),
@@ -146,7 +175,7 @@ def _station(data: ObservationData) -> Iterator[Family]:
         "The station moved before pose {pose}",
         grid=tuple({"pose": i} for i in first),
         ordered={"pose": every},
-        displace=moved,
+        observation_shift=moved,
         covariates=("index",),
     )
 
@@ -156,7 +185,7 @@ def _cross_columns(arm: Array) -> Array:
     return np.cross(np.eye(3)[None, :, :], arm[:, None, :]).swapaxes(1, 2)
 
 
-def _body(data: ObservationData, ids: tuple[int, ...], body: str) -> Iterator[Family]:
+def _body(data: ObservationData, ids: tuple[int, ...], body: str) -> Iterator[ObservationCause]:
     present = [i for i in ids if np.any(data.target == i)]
     if len(present) < 2:
         return
@@ -165,16 +194,14 @@ def _body(data: ObservationData, ids: tuple[int, ...], body: str) -> Iterator[Fa
         def shifted(d: ObservationData, c: Constants, t: int = target) -> Array:
             return d.world_T_tool[:, :3, :3] * (d.target == t)[:, None, None]
 
-        yield Family(
-            "target_shifted",
-            "body",
+        yield ObservationCause(
+            TARGET_SHIFTED,
             str(target),
             None,
             ("x", "y", "z"),
             (5e-4, 5e-4, 5e-4),
             lambda v, c: {"shift_mm": [float(x) * 1e3 for x in v]},
-            "Target {where} sits at another place than its file says, by {shift_mm} mm",
-            displace=shifted,
+            observation_shift=shifted,
             weight=1.0 / len(present),
         )
     pairs = [(i, j) for k, i in enumerate(present) for j in present[k + 1 :]]
@@ -184,21 +211,19 @@ def _body(data: ObservationData, ids: tuple[int, ...], body: str) -> Iterator[Fa
         def grown(d: ObservationData, c: Constants, change: Course = change) -> Array:
             return np.einsum("mij,mj->mi", d.world_T_tool[:, :3, :3], d.p_tool)[:, :, None] * change(d)
 
-        yield Family(
-            "body_thermal_growth",
-            "body",
+        yield ObservationCause(
+            BODY_THERMAL_GROWTH,
             body,
             None,
             ("growth",),
             (1.5e-5,),
             lambda v, c: {"um_per_m_K": float(v[0]) * 1e6},
-            "The measuring body {where} grows by {um_per_m_K:.1f} um per metre and kelvin",
-            displace=grown,
+            observation_shift=grown,
             covariates=(name,),
         )
 
 
-def swapped(data: ObservationData, i: int, j: int) -> Family:
+def swapped(data: ObservationData, i: int, j: int) -> ObservationCause:
     """Targets i and j carry each other's number: one column with the amplitude one."""
     there = {t: data.p_tool[np.flatnonzero(data.target == t)[0]] for t in (i, j)}
 
@@ -207,34 +232,24 @@ def swapped(data: ObservationData, i: int, j: int) -> Family:
         step = step + np.where((d.target == j)[:, None], there[i] - there[j], 0.0)
         return np.einsum("mij,mj->mi", d.world_T_tool[:, :3, :3], step)[:, :, None]
 
-    return Family(
-        "target_swapped",
-        "body",
-        str(i),
-        None,
-        ("share",),
-        (1.0,),
-        lambda v, c: {"with": j},
-        f"Targets {i} and {j} carry each other's number",
-        displace=displace,
+    return ObservationCause(
+        TARGET_SWAPPED, str(i), None, ("share",), (1.0,), lambda v, c: {"with": j}, observation_shift=displace
     )
 
 
-def _wire() -> Iterator[Family]:
+def _wire() -> Iterator[ObservationCause]:
     def length(d: ObservationData) -> Array:
         return np.linalg.norm(d.p_world, axis=1)
 
-    def family(cause: str, prior: float, report: str, factor: float, sentence: str, law: object) -> Family:
-        return Family(
-            cause,
-            "wire",
+    def cause(kind: Kind, prior: float, name: str, factor: float, law: Course) -> ObservationCause:
+        return ObservationCause(
+            kind,
             "wire",
             None,
             ("amount",),
             (prior,),
-            lambda v, c: {report: float(v[0]) * factor},
-            sentence,
-            displace=lambda d, c: law(d)[:, None, None],  # type: ignore[operator]
+            lambda v, c: {name: float(v[0]) * factor},
+            observation_shift=lambda d, c: law(d)[:, None, None],
         )
 
     def sag(d: ObservationData) -> Array:
@@ -244,75 +259,60 @@ def _wire() -> Iterator[Family]:
 
     yield replace(
         # 4.5 g/m: a steel wire of 0.9 mm; what matters is the ratio to the tension, which varies as much
-        family("wire_sag", 2e-5, "g_per_m", 1.0, "The wire sags as one of {g_per_m:.1f} g/m does", sag),
+        cause(WIRE_SAG, 2e-5, "g_per_m", 1.0, sag),
         report=lambda v, c: {"g_per_m": float(np.sqrt(max(v[0], 0.0))) * 1e3},
         positive=0.99,
     )
-    yield family(
-        "wire_stretch",
-        1e-4,
-        "ppm_per_m",
-        1e6,
-        "The wire stretches by {ppm_per_m:.0f} ppm per metre drawn",
-        lambda d: length(d) ** 2,
-    )
-    yield family("wire_scale", 3e-4, "ppm", 1e6, "The wire encoder counts {ppm:.0f} ppm too much", length)
-    yield family(
-        "wire_offset", 1e-3, "mm", 1e3, "The wire's zero is off by {mm:.2f} mm", lambda d: np.ones(len(d.pose))
-    )
-    wrap = family(
-        "pulley_wrap",
+    yield cause(WIRE_STRETCH, 1e-4, "ppm_per_m", 1e6, lambda d: length(d) ** 2)
+    yield cause(WIRE_SCALE, 3e-4, "ppm", 1e6, length)
+    yield cause(WIRE_OFFSET, 1e-3, "mm", 1e3, lambda d: np.ones(len(d.pose)))
+    # over the top of the pulley: the higher the wire leaves, the less of it is wrapped
+    wrap = cause(
+        PULLEY_WRAP,
         5e-3,
         "radius_mm",
         1e3,
-        "The wire wraps around a pulley of {radius_mm:.1f} mm radius that the model leaves out",
-        # over the top of the pulley: the higher the wire leaves, the less of it is wrapped
         lambda d: -np.arctan2(d.p_world[:, 2], np.hypot(d.p_world[:, 0], d.p_world[:, 1])),
     )
     yield replace(wrap, positive=0.99)
 
 
-def _sensor(data: ObservationData, body: str) -> Iterator[Family]:
+def _sensor(data: ObservationData, body: str) -> Iterator[ObservationCause]:
     if data.p_sensor is None:
         return
-    yield Family(
-        "sensor_scale",
-        "sensor",
+    yield ObservationCause(
+        SENSOR_SCALE,
         "sensor",
         None,
         ("scale",),
         (1e-3,),
         lambda v, c: {"ppm": float(v[0]) * 1e6},
-        "The sensor measures {ppm:.0f} ppm too long",
-        # residuals are p_world - T p_sensor: a longer measurement makes them shorter
-        displace=lambda d, c: -np.einsum("mij,mj->mi", d.world_T_tool[:, :3, :3], _required(d.p_sensor))[:, :, None],
+        observation_shift=lambda d, c: (
+            -np.einsum("mij,mj->mi", d.world_T_tool[:, :3, :3], _required(d.p_sensor))[:, :, None]
+        ),
     )
-    yield Family(
-        "sensor_rotation",
-        "sensor",
+    yield ObservationCause(
+        SENSOR_ROTATION,
         "sensor",
         None,
         ("rx", "ry", "rz"),
         (2e-3, 2e-3, 2e-3),
         lambda v, c: {"deg": [float(x) * DEG for x in v]},
-        "The sensor's axes are turned by {deg} deg",
-        displace=lambda d, c: d.world_T_tool[:, :3, :3] @ _cross_columns(_required(d.p_sensor)),
+        observation_shift=lambda d, c: d.world_T_tool[:, :3, :3] @ _cross_columns(_required(d.p_sensor)),
     )
     for name, change in _temperatures(data):
 
         def grown(d: ObservationData, c: Constants, change: Course = change) -> Array:
             return -d.p_world[:, :, None] * change(d)
 
-        yield Family(
-            "sphere_growth",
-            "sensor",
+        yield ObservationCause(
+            SPHERE_GROWTH,
             body,
             None,
             ("growth",),
             (1e-5,),
             lambda v, c: {"um_per_m_K": float(v[0]) * 1e6},
-            "The calibration sphere grows by {um_per_m_K:.1f} um per metre and kelvin",
-            displace=grown,
+            observation_shift=grown,
             covariates=(name,),
         )
 
@@ -323,15 +323,4 @@ def _required(p_sensor: Array | None) -> Array:
     return p_sensor
 
 
-def describe(sentence: str, where: str, direction: str | None, told: Mapping[str, object]) -> str:
-    """Fill a family's sentence: axis names are spelled out for people, lists shortened to three decimals."""
-
-    def spelled(place: object) -> object:
-        return re.sub(r"^axis(\d+)$", r"axis \1", place) if isinstance(place, str) else place
-
-    shown = {
-        name: ", ".join(f"{x:.3f}" for x in value) if isinstance(value, list) else spelled(value)
-        for name, value in told.items()
-    }
-    text = sentence.format(where=spelled(where), direction=direction or "", **shown)
-    return text[0].upper() + text[1:]
+ENTRIES = (Entry(on_observations=measuring_causes),)

@@ -17,7 +17,7 @@ LEAST_MOMENT = 0.1
 """N m; what stays below it carries no load."""
 
 
-def usual_size(name: str, variables: Mapping[str, Array]) -> float:
+def prior_scale(name: str, variables: Mapping[str, Array]) -> float:
     """Usual size of a deviation (m, rad), or of an elasticity (rad/(N m)) by the deflection under the largest load.
 
     Zero for anything else (loads, gravity, amplitudes), and for elasticities without a load.
@@ -31,6 +31,6 @@ def usual_size(name: str, variables: Mapping[str, Array]) -> float:
     return DEFLECTION / largest if largest > LEAST_MOMENT else 0.0
 
 
-def usual_sizes(names: Sequence[str], variables: Mapping[str, Array]) -> Array:
+def prior_scales(names: Sequence[str], variables: Mapping[str, Array]) -> Array:
     """The same for many names (p,)."""
-    return np.array([usual_size(name, variables) for name in names])
+    return np.array([prior_scale(name, variables) for name in names])

@@ -6,13 +6,22 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from robcal.physics.cause import Array, Constants, Family, ObservationData
+from robcal.cause import Kind
+from robcal.physics.cause import Array, Constants, ObservationCause, ObservationData
+
+REFRACTION = Kind(
+    "refraction",
+    "camera",
+    "refraction",
+    "The lines of sight of the station bend along {direction} (refraction), {curvature_per_km:.4f} per km",
+    displaces_marks=True,
+)
 
 STEP = 1e-3
 """Metres over which the field is differentiated: it is a polynomial of the second degree, so any will do."""
 
 
-def refraction_families(data: ObservationData) -> Iterator[Family]:
+def refraction_causes(data: ObservationData) -> Iterator[ObservationCause]:
     """A bend towards each axis, from a place that is not known or from the origin, and a smooth warp of space."""
     yield from (_bent_sight(data, axis) for axis in range(3))
     yield from (_bent_from_origin(axis) for axis in range(3))
@@ -46,7 +55,7 @@ def _bend(arm: Array, axis: int) -> Array:
     return np.asarray(0.5 * out)
 
 
-def _bent_sight(data: ObservationData, axis: int) -> Family:
+def _bent_sight(data: ObservationData, axis: int) -> ObservationCause:
     """Light bends evenly across the line of sight: points move by curvature * distance^2 / 2 towards one axis.
 
     The distance is from where the instrument stands, which is not known: with `w` its place from the centre `c`, the
@@ -78,21 +87,19 @@ def _bent_sight(data: ObservationData, axis: int) -> Family:
             "term": {"variables": ["x_m", "y_m", "z_m"], "kind": "formula", "formula": law},
         }
 
-    return Family(
-        "refraction",
-        "camera",
+    return ObservationCause(
+        REFRACTION,
         "station",
         letter,
         names,
         (2e-5, 1e-4, 1e-4, 1e-4),
         report,
-        "The lines of sight of the station bend along {direction} (refraction), {curvature_per_km:.4f} per km",
-        displace=_warping(bent),
+        observation_shift=_warping(bent),
         weight=0.125,
     )
 
 
-def _bent_from_origin(axis: int) -> Family:
+def _bent_from_origin(axis: int) -> ObservationCause:
     """The same for an instrument that stands where its coordinates begin, as trackers do: one number."""
 
     def bent(points: Array) -> Array:
@@ -108,21 +115,12 @@ def _bent_from_origin(axis: int) -> Family:
         }
         return {"curvature_per_km": 1e3 * float(v[0]), "term": term}
 
-    return Family(
-        "refraction",
-        "camera",
-        "station",
-        letter,
-        ("curvature",),
-        (2e-5,),
-        report,
-        "The lines of sight of the station bend along {direction} (refraction), {curvature_per_km:.4f} per km",
-        displace=_warping(bent),
-        weight=0.125,
+    return ObservationCause(
+        REFRACTION, "station", letter, ("curvature",), (2e-5,), report, observation_shift=_warping(bent), weight=0.125
     )
 
 
-def _warped(data: ObservationData) -> Family:
+def _warped(data: ObservationData) -> ObservationCause:
     """A line of sight that bends (a temperature gradient, a window) warps space smoothly: a quadratic field.
 
     Rigid motion and scale are left to their own causes; the field is centred on the measured volume and given per
@@ -148,15 +146,14 @@ def _warped(data: ObservationData) -> Family:
             }
         }
 
-    return Family(
-        "refraction",
-        "camera",
+    return ObservationCause(
+        REFRACTION,
         "station",
         None,
         names,
         (1e-4,) * len(names),
         report,
         "The lines of sight of the station are bent (refraction): the measured space is warped",
-        displace=_warping(bent),
+        observation_shift=_warping(bent),
         weight=0.25,
     )

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from robcal.physics.cause import DEG, Array
+from robcal.physics.cause import DEG, Array, RobotCause
 from robcal.physics.prior_scale import DEFLECTION, LEAST_MOMENT
 from robcal.robot.model import RobotModel
 
@@ -27,7 +27,7 @@ class Joint:
 
     @property
     def where(self) -> str:
-        """Its name in the contract."""
+        """Its name in files and reports."""
         return f"axis{self.number}"
 
     @property
@@ -77,6 +77,11 @@ class RobotSite:
         )
 
     @property
+    def moving_joints(self) -> tuple[Joint, ...]:
+        """The joints that move in the recording."""
+        return tuple(joint for joint in self.joints if self.varies(f"q{joint.number}", 1e-6))
+
+    @property
     def poses(self) -> int:
         """Number of poses."""
         return len(self.variables["index"])
@@ -122,3 +127,29 @@ def exponential_law(start_s: float, duration_h: float, tau_h: float) -> tuple[st
     scale = float(duration_h / -np.expm1(-duration_h / tau_h))
     law = "(scale*(1 - exp((start_s - time_s)/tau_s)))"
     return law, {"scale": scale, "start_s": start_s, "tau_s": 3600.0 * tau_h}
+
+
+def each_joint(at: Callable[[RobotSite, Joint], Iterable[RobotCause]]) -> Callable[[RobotSite], Iterator[RobotCause]]:
+    """Causes at every joint that moves, which share one prior weight."""
+
+    def on_robot(site: RobotSite) -> Iterator[RobotCause]:
+        joints = site.moving_joints
+        causes = [cause for joint in joints for cause in at(site, joint)]
+        yield from (replace(cause, weight=cause.weight / len(joints)) for cause in causes)
+
+    return on_robot
+
+
+def each_place(at: Callable[[RobotSite, Joint], Iterable[RobotCause]]) -> Callable[[RobotSite], Iterator[RobotCause]]:
+    """Causes in the frames of all joints, which share one prior weight evenly."""
+    return evenly(lambda site: (cause for joint in site.joints for cause in at(site, joint)))
+
+
+def evenly(at: Callable[[RobotSite], Iterable[RobotCause]]) -> Callable[[RobotSite], Iterator[RobotCause]]:
+    """Causes at all places of a robot, which share one prior weight evenly."""
+
+    def on_robot(site: RobotSite) -> Iterator[RobotCause]:
+        causes = list(at(site))
+        yield from (replace(cause, weight=cause.weight / len(causes)) for cause in causes)
+
+    return on_robot

@@ -3,48 +3,79 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 
-from robcal.physics.cause import DEG, PER_KNM, Array, Basis, Constants, Family, Report
+from robcal.cause import Kind
+from robcal.physics.cause import DEG, PER_KNM, Array, Basis, Constants, Entry, Report, RobotCause
 from robcal.physics.prior_scale import LEAST_MOMENT
-from robcal.physics.site import LETTER_OF_KIND, Joint, RobotSite, breaks, exponential_law
+from robcal.physics.site import LETTER_OF_KIND, Joint, RobotSite, breaks, each_place, exponential_law
 from robcal.robot.terms import identifier
 
+BASE_MOVED = Kind(
+    "base_moved",
+    "robot",
+    "base that moved",
+    "The base of the robot moved before pose {pose}",
+    moves="base",
+    of_order=True,
+)
+BASE_TILT = Kind(
+    "base_tilt",
+    "robot",
+    "tilt of the base against gravity",
+    "The base stands {tilt_deg:.2f} deg off the plumb line, which changes the deflections",
+)
+LINK_COMPLIANCE = Kind(
+    "link_compliance",
+    "robot",
+    "elasticity across the joint's axis",
+    "The link or bearing of {where} gives way about {direction} by {compliance_deg_per_kNm:.3g} deg/kNm",
+)
+GEOMETRY = Kind("geometry", "robot", "geometric deviation")
+AXIS_WOBBLE = Kind(
+    "axis_wobble",
+    "robot",
+    "wobble of an axis",
+    "{where} wobbles about {direction} by {amplitude_deg:.4f} deg, {order} times a turn",
+)
+BASE_COMPLIANCE = Kind(
+    "base_compliance",
+    "robot",
+    "foundation that deflects",
+    "The foundation tilts under the overturning moment by {compliance_deg_per_kNm:.3g} deg/kNm",
+)
+PAYLOAD_MASS = Kind(
+    "payload_mass", "robot", "mass of the load", "Payload {where} weighs {mass_kg:.1f} kg, not what the campaign says"
+)
+PAYLOAD_COG = Kind(
+    "payload_cog",
+    "robot",
+    "centre of gravity of the load",
+    "The centre of gravity of payload {where} lies at {cog_mm} mm, not where the campaign says",
+)
+THERMAL_GROWTH = Kind("thermal_growth", "robot", "thermal growth")
 
-def structure_families(site: RobotSite) -> Iterator[Family]:
-    """All families of causes outside the joints' own direction of rotation."""
-    joints = list(site.joints)
-    for maker in (_link_compliance, _geometry, _wobble, _growth):
-        families = [family for joint in joints for family in maker(site, joint)]
-        yield from (replace(family, weight=family.weight / len(families)) for family in families)
-    yield from _base(site)
-    yield from _gravity(site)
-    yield from _payloads(site)
 
-
-def _link_compliance(site: RobotSite, joint: Joint) -> Iterator[Family]:
+def _link_compliance(site: RobotSite, joint: Joint) -> Iterator[RobotCause]:
     for angle in joint.cross_angles if not joint.prismatic else ("roll", "pitch", "yaw"):
         name = f"{joint.frame}.elastic_{angle}"
         if name in site.fitted or not site.varies(f"{identifier(joint.frame)}_m{angle}", LEAST_MOMENT):
             continue
-        yield Family(
-            "link_compliance",
-            "robot",
+        yield RobotCause(
+            LINK_COMPLIANCE,
             joint.where,
             LETTER_OF_KIND[angle],
             (name,),
             (site.compliance(f"{identifier(joint.frame)}_m{angle}", 1e-6),),
             lambda v, c: {"compliance_deg_per_kNm": float(v[0]) * PER_KNM},
-            "The link or bearing of {where} gives way about {direction} by {compliance_deg_per_kNm:.3g} deg/kNm",
             positive=0.95,
-            frees=(name,),
+            free_parameters=(name,),
             covariates=(f"{identifier(joint.frame)}_m{angle}",),
         )
 
 
-def _geometry(site: RobotSite, joint: Joint) -> Iterator[Family]:
+def _geometry(site: RobotSite, joint: Joint) -> Iterator[RobotCause]:
     for kind in ("x", "y", "z", "roll", "pitch", "yaw"):
         name = f"{joint.frame}.{kind}"
         if name in site.fitted or name in site.tied:
@@ -55,20 +86,19 @@ def _geometry(site: RobotSite, joint: Joint) -> Iterator[Family]:
         def report(v: Array, c: Constants, key: str = f"{kind}_{unit}", scale: float = factor) -> dict[str, object]:
             return {key: float(v[0]) * scale}
 
-        yield Family(
-            "geometry",
-            "robot",
+        yield RobotCause(
+            GEOMETRY,
             joint.where,
             LETTER_OF_KIND[kind],
             (name,),
             (5e-4,),
             report,
             f"The {kind} of {{where}} is off by {{{kind}_{unit}:.4f}} {unit}, which the model held fixed",
-            frees=(name,),
+            free_parameters=(name,),
         )
 
 
-def _wobble(site: RobotSite, joint: Joint) -> Iterator[Family]:
+def _wobble(site: RobotSite, joint: Joint) -> Iterator[RobotCause]:
     if joint.prismatic or not site.varies(f"q{joint.number}", 1e-6):
         return
     for angle in joint.cross_angles:
@@ -87,22 +117,20 @@ def _wobble(site: RobotSite, joint: Joint) -> Iterator[Family]:
                 "phase_deg": float(np.degrees(np.arctan2(v[1], v[0]))),
             }
 
-        yield Family(
-            "axis_wobble",
-            "robot",
+        yield RobotCause(
+            AXIS_WOBBLE,
             joint.where,
             LETTER_OF_KIND[angle],
             ("cosine", "sine"),
             (2e-4, 2e-4),
             report,
-            "{where} wobbles about {direction} by {amplitude_deg:.4f} deg, {order} times a turn",
             grid=({"order": 1.0}, {"order": 2.0}, {"order": 3.0}),
             bases=bases,
             covariates=(f"q{joint.number}",),
         )
 
 
-def _growth(site: RobotSite, joint: Joint) -> Iterator[Family]:
+def _growth(site: RobotSite, joint: Joint) -> Iterator[RobotCause]:
     nominal = site.model.frame(joint.frame).xyz
     for k, axis in enumerate("xyz"):
         length = float(nominal[k])
@@ -116,9 +144,8 @@ def _growth(site: RobotSite, joint: Joint) -> Iterator[Family]:
             def warm(c: Constants, axis: str = axis, law: str = law) -> tuple[Basis, ...]:
                 return (Basis(joint.frame, axis, law, "growth"),)
 
-            yield Family(
-                "thermal_growth",
-                "robot",
+            yield RobotCause(
+                THERMAL_GROWTH,
                 joint.where,
                 axis,
                 ("growth",),
@@ -142,9 +169,8 @@ def _growth(site: RobotSite, joint: Joint) -> Iterator[Family]:
                 law, constants = exponential_law(start, duration, c["tau_h"])
                 return (Basis(joint.frame, axis, f"{sign!r}*{law}", "growth", constants),)
 
-            yield Family(
-                "thermal_growth",
-                "robot",
+            yield RobotCause(
+                THERMAL_GROWTH,
                 joint.where,
                 axis,
                 ("growth",),
@@ -158,17 +184,15 @@ def _growth(site: RobotSite, joint: Joint) -> Iterator[Family]:
             )
 
 
-def _base(site: RobotSite) -> Iterator[Family]:
+def _base(site: RobotSite) -> Iterator[RobotCause]:
     if any(site.varies(f"base_m{axis}", LEAST_MOMENT) for axis in "xy"):
-        yield Family(
-            "base_compliance",
-            "robot",
+        yield RobotCause(
+            BASE_COMPLIANCE,
             "base",
             None,
             ("compliance",),
             (min(site.compliance(f"base_m{axis}", 3e-7) for axis in "xy"),),
             lambda v, c: {"compliance_deg_per_kNm": float(v[0]) * PER_KNM},
-            "The foundation tilts under the overturning moment by {compliance_deg_per_kNm:.3g} deg/kNm",
             positive=0.98,
             bases=lambda c: (
                 Basis("base", "roll", "base_mx", "compliance"),
@@ -178,9 +202,8 @@ def _base(site: RobotSite) -> Iterator[Family]:
         )
     first, every = breaks(site.variables["index"], 3)
     kinds = ("x", "y", "z", "roll", "pitch", "yaw")
-    yield Family(
-        "base_moved",
-        "robot",
+    yield RobotCause(
+        BASE_MOVED,
         "base",
         None,
         kinds,
@@ -190,7 +213,6 @@ def _base(site: RobotSite) -> Iterator[Family]:
             "shift_mm": [float(x) * 1e3 for x in v[:3]],
             "turn_deg": [float(x) * DEG for x in v[3:]],
         },
-        "The base of the robot moved before pose {pose}",
         grid=tuple({"pose": i} for i in first),
         ordered={"pose": every},
         bases=lambda c: tuple(Basis("base", kind, "step(index - pose + 0.5)", kind, c) for kind in kinds),
@@ -198,7 +220,7 @@ def _base(site: RobotSite) -> Iterator[Family]:
     )
 
 
-def _gravity(site: RobotSite) -> Iterator[Family]:
+def _gravity(site: RobotSite) -> Iterator[RobotCause]:
     names = ("gravity.tilt_x", "gravity.tilt_y")
     if any(name in site.fitted for name in names) or not _elastic(site):
         return
@@ -207,52 +229,38 @@ def _gravity(site: RobotSite) -> Iterator[Family]:
         # a turn (tx, ty) of the downward vector leans it towards x by -ty and towards y by tx
         return {"tilt_deg": float(np.hypot(*v)) * DEG, "azimuth_deg": float(np.degrees(np.arctan2(v[0], -v[1])))}
 
-    yield Family(
-        "base_tilt",
-        "robot",
-        "base",
-        None,
-        names,
-        (0.02, 0.02),
-        report,
-        "The base stands {tilt_deg:.2f} deg off the plumb line, which changes the deflections",
-        frees=names,
-    )
+    yield RobotCause(BASE_TILT, "base", None, names, (0.02, 0.02), report, free_parameters=names)
 
 
 def _elastic(site: RobotSite) -> bool:
     return any(".elastic_" in name and value for name, value in site.model.parameters.items())
 
 
-def _payloads(site: RobotSite) -> Iterator[Family]:
+def _payloads(site: RobotSite) -> Iterator[RobotCause]:
     if not _elastic(site):
         return
     for name, payload in site.model.payloads.items():
         mass_name = f"payload.{name}.mass"
         if mass_name in site.fitted:
             continue
-        yield Family(
-            "payload_mass",
-            "robot",
+        yield RobotCause(
+            PAYLOAD_MASS,
             name,
             None,
             (mass_name,),
             (max(0.15 * payload.mass, 0.5),),
             _mass_report(payload.mass),
-            "Payload {where} weighs {mass_kg:.1f} kg, not what the campaign says",
-            frees=(mass_name,),
+            free_parameters=(mass_name,),
         )
         cog_names = tuple(f"payload.{name}.{axis}" for axis in "xyz")
-        yield Family(
-            "payload_cog",
-            "robot",
+        yield RobotCause(
+            PAYLOAD_COG,
             name,
             None,
             cog_names,
             (0.1, 0.1, 0.1),
             _cog_report(np.array(payload.cog)),
-            "The centre of gravity of payload {where} lies at {cog_mm} mm, not where the campaign says",
-            frees=cog_names,
+            free_parameters=cog_names,
         )
 
 
@@ -262,3 +270,14 @@ def _mass_report(stated: float) -> Report:
 
 def _cog_report(stated: Array) -> Report:
     return lambda v, c: {"cog_mm": [float(x) * 1e3 for x in stated + v]}
+
+
+ENTRIES = (
+    Entry(on_robot=each_place(_link_compliance)),
+    Entry(on_robot=each_place(_geometry)),
+    Entry(on_robot=each_place(_wobble)),
+    Entry(on_robot=each_place(_growth)),
+    Entry(on_robot=_base),
+    Entry(on_robot=_gravity),
+    Entry(on_robot=_payloads),
+)

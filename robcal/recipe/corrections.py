@@ -11,6 +11,7 @@ from robcal.calibration.measurements import RobotObservations, RobotRecording
 from robcal.calibration.observations import DistanceObservations, FrameObservations
 from robcal.diagnosis.core.recording import Recording, observation_data
 from robcal.diagnosis.core.result import Diagnosis
+from robcal.physics.cause import ObservationCause
 from robcal.robot.kernel_cache import kernel_of
 from robcal.transforms import retract
 
@@ -23,7 +24,9 @@ def corrected(recording: RobotRecording, log: JointLog, diagnosis: Diagnosis) ->
 
     Weakness: displaced targets of a body and exchanged ids are not corrected in frames.
     """
-    found = [f for f in diagnosis.findings if f.family.displace is not None and f.family.stage in MEASURING]
+    found = [
+        (f, f.cause) for f in diagnosis.findings if isinstance(f.cause, ObservationCause) and f.cause.stage in MEASURING
+    ]
     if not found:
         return None
     kernel = kernel_of(diagnosis.model, "converged")
@@ -32,7 +35,8 @@ def corrected(recording: RobotRecording, log: JointLog, diagnosis: Diagnosis) ->
         rows = Recording(log.q, log.payload, log.recorded(), log.names, o)
         inputs = rows.inputs(kernel)
         data = observation_data(rows, kernel.frames(kernel.theta0, inputs), kernel.variables(kernel.theta0, inputs))
-        shift = sum((f.family.displace(data, f.constants) @ f.values for f in found if f.family.displace), np.zeros(()))
+        shifts = (cause.observation_shift(data, f.constants) @ f.values for f, cause in found)
+        shift = sum(shifts, np.zeros(()))
         if isinstance(o, FrameObservations):
             return dataclasses.replace(o, world_T_tool=retract(o.world_T_tool, -shift))
         if isinstance(o, DistanceObservations):

@@ -18,7 +18,7 @@ from robcal.diagnosis.core.result import Diagnosis, Finding
 from robcal.diagnosis.gain.heldout import cross_validated, folds, position_errors
 from robcal.diagnosis.noise.swaps import find_swaps, relabelled
 from robcal.diagnosis.scan.tangents import Tangents, tangents
-from robcal.physics.cause import Array, Basis, Constants
+from robcal.physics.cause import Array, Basis, Constants, ObservationCause
 from robcal.robot.model import RobotModel
 from robcal.robot.terms import identifier, names_in
 
@@ -80,22 +80,24 @@ def evidence_of(
     ----------
     model, free : the robot as it was identified, before the diagnosis, and its fitted parameters.
     """
-    swaps = find_swaps(recording) if any(f.family.cause == "target_swapped" for f in diagnosis.findings) else ()
+    swaps = find_swaps(recording) if any(f.cause.kind.is_relabelling for f in diagnosis.findings) else ()
     clean = relabelled(recording, swaps)
     clean = clean.subset(~np.isin(np.array(clean.names), diagnosis.blunders))
-    findings = [f for f in diagnosis.findings if f.family.cause != "target_swapped"]
+    findings = [f for f in diagnosis.findings if not f.cause.kind.is_relabelling]
     direct = [
-        Accepted(f.family, f.constants, f.values, f.covariance) for f in findings if f.family.displace is not None
+        Accepted(f.cause, f.constants, f.values, f.covariance)
+        for f in findings
+        if isinstance(f.cause, ObservationCause)
     ]
     after = fit(diagnosis.model, clean, diagnosis.free, direct)
     before = fit(model, recording, free)
     # pose by pose: errors common to all poses are taken off as they were estimated
     alone = replace(clean, common=None)
-    looks = [(tangents(after, alone), clean.beside_common(after.residual), alone, False)]
+    analyses = [(tangents(after, alone), clean.beside_common(after.residual), alone, False)]
     if verify is not None:
         tested = relabelled(verify, swaps)
         there, alone = _elsewhere(after, tested), replace(tested, common=None)
-        looks.append((tangents(there, alone), _left_over(there, alone), alone, True))
+        analyses.append((tangents(there, alone), _left_over(there, alone), alone, True))
         errors = [position_errors(r, f) for r, f in ((verify, before), (tested, after))]
         rows = verify.observations.pose
         names = verify.names
@@ -103,7 +105,7 @@ def evidence_of(
         errors = [cross_validated(r, f, folds(r)) for r, f in ((recording, before), (clean, after))]
         rows, names = recording.observations.pose, recording.names
     scale = float(np.sqrt(after.variance_factor))
-    causes = tuple(e for finding in findings if (e := _cause(finding, looks, scale)) is not None)
+    causes = tuple(e for finding in findings if (e := _cause(finding, analyses, scale)) is not None)
     first = _by_pose(errors[0], rows, names)
     second = first if not diagnosis.findings else _by_pose(errors[1], *_pose_rows(clean if verify is None else verify))
     both = [name for name in first if name in second]
@@ -138,24 +140,24 @@ def _left_over(there: Fit, recording: Recording) -> Array:
     residual = there.residual
     at = tangents(there, recording)
     for item in there.accepted:
-        if item.family.displace is not None:
-            residual = residual - at.columns(item.family, item.constants) @ item.values
+        if isinstance(item.cause, ObservationCause):
+            residual = residual - at.columns(item.cause, item.constants) @ item.values
     return residual
 
 
 Look = tuple[Tangents, Array, Recording, bool]
 
 
-def _cause(finding: Finding, looks: Sequence[Look], scale: float) -> CauseEvidence | None:
-    """Evidence for one cause over all looks; None where no pose says anything."""
-    group = _group(finding, looks[0][0])
-    parts = [_of_group(finding, group, *look) if group else _of_share(finding, *look) for look in looks]
-    names = _abscissa_first(finding, group, looks[0][0])
+def _cause(finding: Finding, analyses: Sequence[Look], scale: float) -> CauseEvidence | None:
+    """Evidence for one cause over all analyses; None where no pose says anything."""
+    group = _group(finding, analyses[0][0])
+    parts = [_of_group(finding, group, *analysis) if group else _of_share(finding, *analysis) for analysis in analyses]
+    names = _abscissa_first(finding, group, analyses[0][0])
     poses: list[str] = []
     kept: list[bool] = []
     measured, sigma, fitted = [], [], []
     values: dict[str, list[Array]] = {name: [] for name in names}
-    for (d2, y, h), (at, _, recording, kept_out) in zip(parts, looks, strict=True):
+    for (d2, y, h), (at, _, recording, kept_out) in zip(parts, analyses, strict=True):
         enough = d2 > (LEAST_SHARE**2) * max(float(np.max(p[0], initial=0.0)) for p in parts)
         enough &= d2 > 0
         poses += [recording.names[i] for i in np.flatnonzero(enough)]
@@ -168,13 +170,13 @@ def _cause(finding: Finding, looks: Sequence[Look], scale: float) -> CauseEviden
             values[name].append(column[enough])
     if not poses:
         return None
-    family = finding.family
+    cause = finding.cause
     variables = {name: np.concatenate(columns) for name, columns in values.items()}
     curves = _curves(group, variables) if group else {}
     return CauseEvidence(
-        family.cause,
-        family.where,
-        family.direction,
+        cause.name,
+        cause.where,
+        cause.direction,
         f"{group[0][0].frame}.{group[0][0].kind}" if group else "share",
         tuple(poses),
         np.array(kept, dtype=bool),
@@ -191,16 +193,14 @@ Group = list[tuple[Basis, float]]
 
 def _group(finding: Finding, at: Tangents) -> Group:
     """The laws (with their amplitudes) that act on the one coordinate where the cause moves the observations most."""
-    family = finding.family
-    bases: list[Basis] = []
-    if family.bases is not None:
-        bases = list(family.bases(finding.constants))
-    elif family.frees:
-        freed = zip(family.frees, family.parameters, strict=True)
+    cause = finding.cause
+    bases = list(cause.laws(finding.constants))
+    if cause.free_parameters:
+        freed = zip(cause.free_parameters, cause.parameters, strict=True)
         bases = [b for name, short in freed if (b := _freed(name, short, at))]
-        if len(bases) != len(family.frees):
+        if len(bases) != len(cause.free_parameters):
             return []
-    amplitude = dict(zip(family.names(finding.constants), map(float, finding.values), strict=True))
+    amplitude = dict(zip(cause.names(finding.constants), map(float, finding.values), strict=True))
     groups: dict[tuple[str, str], Group] = {}
     for basis in bases:
         groups.setdefault((basis.frame, basis.kind), []).append((basis, amplitude[basis.parameter]))
@@ -241,11 +241,11 @@ def _of_group(finding: Finding, group: Group, at: Tangents, residual: Array, rec
 def _of_share(finding: Finding, at: Tangents, residual: Array, recording: Recording, kept: bool) -> tuple:
     """The same as a share of the whole effect: 1 where the pose shows it as fitted, 0 where not at all."""
     n = len(recording.names)
-    present = at.columns(finding.family, finding.constants) @ finding.values
+    present = at.columns(finding.cause, finding.constants) @ finding.values
     everywhere: Constants = finding.constants
     if "pose" in finding.constants:  # what happens at a pose is looked for before it, too
         everywhere = {**finding.constants, "pose": -1e9}
-    d = at.columns(finding.family, everywhere) @ finding.values
+    d = at.columns(finding.cause, everywhere) @ finding.values
     d2 = np.bincount(at.row_pose, d * d, minlength=n)
     safe = np.where(d2 > 0, d2, 1.0)
     own = np.bincount(at.row_pose, d * (residual + present), minlength=n) / safe
@@ -256,7 +256,7 @@ def _abscissa_first(finding: Finding, group: Group, at: Tangents) -> tuple[str, 
     """Covariates of the law, the one with the most values first; the order of the poses where there is none."""
     names = {name for basis, _ in group for name in names_in(basis.expression)}
     if not group:
-        names = {"index"} if "pose" in finding.constants else set(finding.family.covariates)
+        names = {"index"} if "pose" in finding.constants else set(finding.cause.covariates)
     known = [name for name in names if name in at.variables]
     several = [name for name in known if len(np.unique(at.variables[name])) > 1]
     ordered = sorted(several, key=lambda name: (-len(np.unique(np.round(at.variables[name], 6))), name))

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from robcal.diagnosis.images.data import survey_data
 from robcal.diagnosis.images.diagnosis import ImageDiagnosis, ImageFinding, diagnose_images
 from robcal.diagnosis.images.exchange import exchanged_targets
 from robcal.diagnosis.images.lens_findings import beyond_lenses, station_findings, survey_findings
@@ -14,6 +13,7 @@ from robcal.diagnosis.images.station import given_points
 from robcal.photogrammetry.core.camera import Camera
 from robcal.photogrammetry.core.network import CameraNetwork
 from robcal.photogrammetry.station.network import StationOrientation
+from robcal.physics.images.data import survey_data
 from robcal.recipe.station import StationImages
 
 

@@ -25,6 +25,7 @@ from robcal.diagnosis.search.selection import SelectionSettings
 from robcal.photogrammetry.core.bodies import Body
 from robcal.photogrammetry.measure.measured_points import MeasuredPoints
 from robcal.photogrammetry.station.network import StationOrientation
+from robcal.physics.cause import ObservationCause
 from robcal.physics.prior_scale import DEVIATION
 from robcal.recipe.corrections import corrected
 from robcal.recipe.evidence import Evidence, evidence_of
@@ -34,7 +35,6 @@ from robcal.recipe.in_force import Form, InForce, choose
 from robcal.recipe.recording import recording_for_diagnosis
 from robcal.transforms import Array
 
-UNCORRECTED = frozenset({"refraction", "ellipse_eccentricity", "centroid_bias"})
 BEYOND_DOUBT = 1e-6
 
 
@@ -106,7 +106,7 @@ def diagnose_robot(
         tell,
         optional_parameters(robot),
     )
-    swapped = any(f.family.cause == "target_swapped" for f in diagnosis.findings)
+    swapped = any(f.cause.kind.is_relabelling for f in diagnosis.findings)
     clean = relabelled(recording, find_swaps(recording)) if swapped else recording
     kept = ~np.isin(np.array(clean.names), diagnosis.blunders)
     clean, rows = clean.subset(kept), found.rows[kept]
@@ -205,7 +205,7 @@ def settings_beside(settings: SelectionSettings, findings: Sequence[ImageFinding
 
     What they leave in the frames looks like small causes of the robot; only what is far beyond doubt is told.
     """
-    if any(finding.cause in UNCORRECTED for finding in findings):
+    if any(finding.kind.displaces_marks for finding in findings):
         return replace(settings, level=min(settings.level, BEYOND_DOUBT))
     return settings
 
@@ -213,7 +213,7 @@ def settings_beside(settings: SelectionSettings, findings: Sequence[ImageFinding
 def _displacements(diagnosis: Diagnosis) -> tuple[Accepted, ...]:
     """Causes that displace what is measured: they stand beside the model, all others are in it."""
     return tuple(
-        Accepted(f.family, f.constants, f.values, f.covariance)
+        Accepted(f.cause, f.constants, f.values, f.covariance)
         for f in diagnosis.findings
-        if f.family.displace is not None and f.family.cause != "target_swapped"
+        if isinstance(f.cause, ObservationCause) and not f.cause.kind.is_relabelling
     )

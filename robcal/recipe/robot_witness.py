@@ -15,7 +15,9 @@ from robcal.diagnosis.next_poses import poses_table, row_of
 from robcal.errors import RobcalError
 from robcal.photogrammetry.measure.frames import measure_frames
 from robcal.photogrammetry.measure.points import measure_points
+from robcal.photogrammetry.station.contradictions import CAMERA_MOVED
 from robcal.photogrammetry.station.network import StationMarks, StationOrientation
+from robcal.physics.library import kinds
 from robcal.robot.kernel import Kernel
 from robcal.robot.model import RobotModel
 
@@ -47,12 +49,12 @@ def with_station_moves(
 ) -> dict[str, Any]:
     """A base that moved looks like all cameras moved together: said, with poses to repeat beside targets at rest."""
     causes = [dict(cause) for cause in content["causes"]]
-    moved = [cause for cause in causes if cause["cause"] == "base_moved"]
+    moved = [cause for cause in causes if kinds()[cause["cause"]].moves == "base"]
     if not moved:
         return content
     where = cameras[0] if len(cameras) == 1 else "station"
     for cause in moved:
-        rival = {"cause": "camera_moved", "where": where, "direction": None, "probability": None, "overlap": 1.0}
+        rival = {"cause": CAMERA_MOVED.name, "where": where, "direction": None, "probability": None, "overlap": 1.0}
         cause["indistinguishable_from"] = [*cause["indistinguishable_from"], rival]
     text = (
         "no pose tells a base that moved from cameras that moved together: repeat some with targets at rest "

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from robcal.diagnosis.images.camera_moves import which_moved, with_small_moves
-from robcal.diagnosis.images.data import ImageData
 from robcal.diagnosis.images.diagnosis import ImageFinding
 from robcal.diagnosis.images.dot_sizes import with_dot_sizes
 from robcal.diagnosis.images.light_lag import without_lag
@@ -18,6 +17,7 @@ from robcal.photogrammetry.core.camera import Camera
 from robcal.photogrammetry.station.network import StationMarks, StationOrientation, StationSettings
 from robcal.photogrammetry.station.orientation import orient_station
 from robcal.photogrammetry.station.seen_normals import Ellipses, needs_normals, with_seen_normals
+from robcal.physics.images.data import ImageData
 from robcal.transforms import Array
 
 DEFAULT = StationSettings()

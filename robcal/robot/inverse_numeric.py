@@ -16,10 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import qmc
 
-from robcal.robot.chain import Chain, forward_and_jacobian
+from robcal.estimation.batched import Damping, NormalEquations, minimise_each
+from robcal.estimation.summary import TerminationSettings
+from robcal.robot.chain import Chain, forward, forward_and_jacobian
 from robcal.transforms import Array, difference
 
 BoolArray = NDArray[np.bool_]
+DAMPING = Damping(start=1e-3, shrink=0.2, grow=8.0, largest=1e8)
 Evaluate = Callable[[Array, NDArray[np.int_]], tuple[Array, Array]]
 
 
@@ -83,43 +86,38 @@ def refine(
     ``evaluate(q, rows)`` gives frames and their right-twist Jacobian for the given rows; default: the nominal chain.
     """
     at: Evaluate = evaluate if evaluate is not None else lambda values, _: forward_and_jacobian(chain, values)
-    q = np.array(start, dtype=float)
-    if within_limits:
-        q = np.clip(q, chain.lower, chain.upper)
+    inside = (lambda q: np.clip(q, chain.lower, chain.upper)) if within_limits else (lambda q: q)
     weight = settings.weight(chain)
-    damping = np.full(len(q), 1e-3)
-    T, J = at(q, np.arange(len(q)))
-    r = difference(T, base_T_flange)
-    cost = np.sum((weight * r) ** 2, axis=1)
-    active = np.arange(len(q))
-    eye = np.eye(chain.n_joints)
-    for _ in range(settings.iterations):
-        active = active[cost[active] > (0.01 * settings.tolerance) ** 2]
-        active = active[damping[active] < 1e8]
-        if not len(active):
-            break
-        Jw = weight[:, None] * J[active]
-        normal = np.swapaxes(Jw, 1, 2) @ Jw
-        gradient = np.einsum("nji,nj->ni", Jw, weight * r[active])
+
+    def equations(q: Array, rows: NDArray[np.int_]) -> NormalEquations:
+        T, J = at(q, rows)
+        Jw, r = weight[:, None] * J, weight * difference(T, base_T_flange[rows])
+        turned = np.swapaxes(Jw, 1, 2)
+        normal, right = turned @ Jw, (turned @ r[..., None])[..., 0]
         if within_limits:
-            # joints that rest on a limit and are pushed against it take no part in this step
-            held = ((q[active] <= chain.lower) & (gradient < 0)) | ((q[active] >= chain.upper) & (gradient > 0))
-            gradient = np.where(held, 0.0, gradient)
+            # joints that rest on a limit and are pushed against it take no part in the next step
+            held = ((q <= chain.lower) & (right < 0)) | ((q >= chain.upper) & (right > 0))
+            right = np.where(held, 0.0, right)
             normal = np.where(held[:, :, None] | held[:, None, :], 0.0, normal)
-        scale = damping[active] * np.maximum(np.sqrt(cost[active]), 1e-12) + 1e-14
-        step = np.linalg.solve(normal + scale[:, None, None] * eye, gradient[..., None])[..., 0]
+        return NormalEquations(normal, right, np.sum(r**2, axis=1))
+
+    def moved(q: Array, step: Array) -> Array:
         largest = np.max(np.abs(step), axis=1, keepdims=True)
-        trial = q[active] + step * np.minimum(1.0, 1.0 / np.maximum(largest, 1e-300))
-        if within_limits:
-            trial = np.clip(trial, chain.lower, chain.upper)
-        T_new, J_new = at(trial, active)
-        r_new = difference(T_new, base_T_flange[active])
-        cost_new = np.sum((weight * r_new) ** 2, axis=1)
-        better = cost_new < cost[active]
-        rows = active[better]
-        q[rows], r[rows], J[rows], cost[rows] = trial[better], r_new[better], J_new[better], cost_new[better]
-        damping[active] = np.where(better, np.maximum(damping[active] * 0.2, 1e-9), damping[active] * 8.0)
-    return q, r
+        return inside(q + step * np.minimum(1.0, 1.0 / np.maximum(largest, 1e-300)))
+
+    termination = TerminationSettings(settings.iterations, negligible=(0.01 * settings.tolerance) ** 2)
+    found = minimise_each(equations, moved, inside(np.array(start)), termination, DAMPING, _damped_step)
+    q = found.state
+    T = forward(chain, q) if evaluate is None else evaluate(q, np.arange(len(q)))[0]
+    return q, difference(T, base_T_flange)
+
+
+def _damped_step(equations: NormalEquations, damping: Array) -> Array:
+    """Steps (n, N) damped by the size of the residual (Sugihara 2011), so that the last ones are undamped."""
+    normal = equations.matrix.copy()
+    at = np.arange(normal.shape[-1])
+    normal[:, at, at] += (damping * np.maximum(np.sqrt(equations.cost), 1e-12) + 1e-14)[:, None]
+    return np.asarray(np.linalg.solve(normal, equations.right[..., None])[..., 0])
 
 
 def search(chain: Chain, base_T_flange: Array, near: Array, settings: NumericSettings, *, all_branches: bool) -> Array:

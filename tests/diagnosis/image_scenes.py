@@ -11,7 +11,6 @@ import numpy as np
 from fixtures.effects import Effect
 from fixtures.measuring_effects import swap_labels
 from fixtures.sightings import LENS, Marks, Scene, SightingPlan, draw_scene, draw_sighting_effect, sight, view_name
-from robcal.diagnosis.images.data import ImageData
 from robcal.diagnosis.images.diagnosis import ImageFinding, diagnose_images
 from robcal.diagnosis.images.lens_findings import station_findings
 from robcal.diagnosis.images.station import station_data
@@ -21,6 +20,7 @@ from robcal.photogrammetry.core.network import Lengths
 from robcal.photogrammetry.station.network import StationMarks, StationOrientation
 from robcal.photogrammetry.station.orientation import orient_station
 from robcal.photogrammetry.survey.survey import BodyTarget, SurveyImage, SurveyResult, survey_body
+from robcal.physics.images.data import ImageData
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ def station(*causes: str, snr: float = 12.0, covariates: bool = True, **plan: An
     return Station(effects, names, orientation, marks, given, station_data(orientation, names, given, cameras, change))
 
 
-def told(scene: Station) -> list[ImageFinding]:
+def reported(scene: Station) -> list[ImageFinding]:
     """What the adjustment found by itself and what the scan finds after it."""
     alone = station_findings(scene.orientation, scene.names, scene.given, scene.data.inflation)
     return [*alone, *diagnose_images(scene.data).findings]

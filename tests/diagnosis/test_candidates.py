@@ -9,7 +9,7 @@ import numpy as np
 
 from robcal.diagnosis.core.fitting import fit
 from robcal.diagnosis.scan.tangents import tangents
-from robcal.physics.library import all_families
+from robcal.physics.library import all_causes
 from robcal.physics.site import RobotSite
 from tests.diagnosis.recordings import concealed
 
@@ -22,8 +22,8 @@ def test_moved_base_and_moved_station_span_the_same_beside_common_errors(tmp_pat
     present = fit(found.model, recording, found.names)
     at = tangents(present, recording)
     site = RobotSite(present.model, at.variables, frozenset(present.free), frozenset())
-    families = {f.cause: f for f in all_families(site, at.data, recording.ids, recording.body)}
-    base, station = (at.columns(families[name], {"pose": 20.0}) for name in ("base_moved", "camera_moved"))
+    causes = {f.name: f for f in all_causes(site, at.data, recording.ids, recording.body)}
+    base, station = (at.columns(causes[name], {"pose": 20.0}) for name in ("base_moved", "camera_moved"))
     unit = station / np.linalg.norm(station, axis=0)
     Q = np.linalg.qr(base / np.linalg.norm(base, axis=0))[0]
     assert np.linalg.norm(unit - Q @ (Q.T @ unit), axis=0).max() < 1e-3

@@ -55,7 +55,7 @@ def uneven() -> tuple[Recording, Fit, np.ndarray]:
 def test_curves_of_all_joints_are_found(uneven: tuple[Recording, Fit, np.ndarray]) -> None:
     recording, present, added = uneven
     found = find_curves(present, recording)
-    assert [item.family.where for item in found.accepted] == [f"axis{k}" for k in range(1, 7)]
+    assert [item.cause.where for item in found.accepted] == [f"axis{k}" for k in range(1, 7)]
     assert found.p_value < 1e-100
     errors = nested_errors(present, recording, found.accepted, None)
     assert len(errors) == 7
@@ -63,18 +63,18 @@ def test_curves_of_all_joints_are_found(uneven: tuple[Recording, Fit, np.ndarray
     for k, item in enumerate(found.accepted):
         q = recording.q[:, k]
         slow = np.vander(q, 5)  # zero offsets and slow waves are also geometry
-        truth, told = (y - slow @ np.linalg.lstsq(slow, y, rcond=None)[0] for y in (added[:, k], curve(item, q)))
-        assert np.corrcoef(truth, told)[0, 1] > 0.9
+        truth, reported = (y - slow @ np.linalg.lstsq(slow, y, rcond=None)[0] for y in (added[:, k], curve(item, q)))
+        assert np.corrcoef(truth, reported)[0, 1] > 0.9
 
 
 def test_likeness_tells_turn_and_sense() -> None:
     q = np.linspace(-np.pi, np.pi, 500)
     items = []
     for k, law in ((1, pattern(5, q)), (2, pattern(5, q + 1.0)), (3, -pattern(5, -q + 2.0)), (4, pattern(6, q))):
-        family = periodic_curve(Joint(k, f"axis{k}", "z", 1, False), q, 72)
-        laws = np.stack([b.value({f"q{k}": q}) for b in family.bases(family.grid[0])], axis=1)  # type: ignore[misc]
+        cause = periodic_curve(Joint(k, f"axis{k}", "z", 1, False), q, 72)
+        laws = np.stack([b.value({f"q{k}": q}) for b in cause.bases(cause.grid[0])], axis=1)  # type: ignore[misc]
         values = np.linalg.lstsq(laws, law, rcond=1e-8)[0]
-        items.append(Accepted(family, family.grid[0], values, np.zeros((72, 72))))
+        items.append(Accepted(cause, cause.grid[0], values, np.zeros((72, 72))))
     found = {like.joint: like for like in likenesses(items, [q] * 4)}
     assert set(found) == {"axis2", "axis3"}
     assert (found["axis2"].other, found["axis2"].sense) == ("axis1", 1)
@@ -103,9 +103,9 @@ def test_few_poses_tell_no_curves(uneven: tuple[Recording, Fit, np.ndarray]) -> 
 
 def test_long_laws_become_several_terms_with_priors() -> None:
     q = np.linspace(-3, 3, 100)
-    family = periodic_curve(Joint(2, "axis2", "z", 1, False), q, 72)
-    count = len(family.names(family.grid[0]))
-    terms = terms_of(Accepted(family, family.grid[0], np.arange(count) * 1e-5, np.zeros((count, count))), 0)
+    cause = periodic_curve(Joint(2, "axis2", "z", 1, False), q, 72)
+    count = len(cause.names(cause.grid[0]))
+    terms = terms_of(Accepted(cause, cause.grid[0], np.arange(count) * 1e-5, np.zeros((count, count))), 0)
     assert len(terms) == 3
     assert sum(len(t.priors) for t in terms) == count
     assert [v for t in terms for v in t.parameters.values()] == pytest.approx(np.arange(count) * 1e-5)
@@ -114,16 +114,16 @@ def test_long_laws_become_several_terms_with_priors() -> None:
 @pytest.mark.slow
 def test_diagnosis_models_the_curves(uneven: tuple[Recording, Fit, np.ndarray]) -> None:
     recording, present, added = uneven
-    told = diagnose(present.model, recording, present.free)
-    curves = [f for f in told.findings if "period_deg" in f.parameters]
-    assert [f.family.where for f in curves] == [f"axis{k}" for k in range(1, 7)]
-    assert told.heldout[1] < 0.4 * told.heldout[0]
-    assert told.joint_sigma < 0.5 * np.std(added)
+    reported = diagnose(present.model, recording, present.free)
+    curves = [f for f in reported.findings if "period_deg" in f.parameters]
+    assert [f.cause.where for f in curves] == [f"axis{k}" for k in range(1, 7)]
+    assert reported.heldout[1] < 0.4 * reported.heldout[0]
+    assert reported.joint_sigma < 0.5 * np.std(added)
     assert "turned by" in " ".join(f.statement for f in curves)
 
 
 def test_predicted_covariance_holds_at_poses_kept_out(uneven: tuple[Recording, Fit, np.ndarray]) -> None:
-    """Joints that scatter and curves that are known only where the joints were: errors have the size that is told."""
+    """Joints that scatter and curves that are known only where the joints were: errors have the reported size."""
     s = scenario(3, n=400)
 
     def wrong(q: np.ndarray) -> np.ndarray:
@@ -132,16 +132,16 @@ def test_predicted_covariance_holds_at_poses_kept_out(uneven: tuple[Recording, F
 
     recording, obs = recorded(wrong(s.poses.q), s)
     found = identify(s.model, s.poses, [obs], kernel=s.kernel)
-    told = diagnose(found.model, recording, found.names)
-    assert [f.family.where for f in told.findings][:6] == [f"axis{k}" for k in range(1, 7)]
-    assert told.joint_sigma == pytest.approx(1e-4, rel=0.4)
+    reported = diagnose(found.model, recording, found.names)
+    assert [f.cause.where for f in reported.findings][:6] == [f"axis{k}" for k in range(1, 7)]
+    assert reported.joint_sigma == pytest.approx(1e-4, rel=0.4)
     true = s.truth.frames(s.theta, s.kept_out.with_q(wrong(s.kept_out.q)))
-    kernel = Kernel(told.model, "converged")
+    kernel = Kernel(reported.model, "converged")
     inputs = kernel.poses(s.kept_out.q, "dumbbell", {"index": np.arange(len(s.kept_out), dtype=float)})
-    T, J = kernel.frames_and_jacobian(kernel.theta0, inputs, np.array([kernel.index[n] for n in told.free]))
-    moved = told.joint_sigma * kernel.joint_jacobian(kernel.theta0, inputs)
+    T, J = kernel.frames_and_jacobian(kernel.theta0, inputs, np.array([kernel.index[n] for n in reported.free]))
+    moved = reported.joint_sigma * kernel.joint_jacobian(kernel.theta0, inputs)
     error = (tf.invert(T) @ true)[:, :3, 3]
-    parameters = (J @ told.covariance @ J.swapaxes(1, 2))[:, :3, :3]
+    parameters = (J @ reported.covariance @ J.swapaxes(1, 2))[:, :3, :3]
     whole = parameters + (moved @ moved.swapaxes(1, 2))[:, :3, :3]
 
     def normalised(V: np.ndarray) -> float:

@@ -11,11 +11,13 @@ import numpy as np
 import pytest
 
 from robcal.calibration.observations import PointObservations
-from robcal.diagnosis.content import as_contract
+from robcal.diagnosis.content import diagnosis_content
 from robcal.diagnosis.core.fitting import Accepted
 from robcal.diagnosis.core.result import Diagnosis
-from robcal.diagnosis.diagnose import diagnose, told_through
-from robcal.physics.cause import Family
+from robcal.diagnosis.diagnose import diagnose
+from robcal.diagnosis.findings import rescaled
+from robcal.physics.cause import LinearCause
+from robcal.physics.joint import COUNTERBALANCE
 from robcal.recipe.robot_diagnosis import own_elasticities
 from robcal.transforms import exp_so3
 from tests.diagnosis.recordings import concealed
@@ -30,16 +32,16 @@ def test_nothing_missing(tmp_path: Path) -> None:
     diagnosis, _ = run(tmp_path, 100)
     assert not diagnosis.mismatch
     assert diagnosis.p_value > 0.01
-    assert "Nothing is missing" in str(as_contract(diagnosis)["statement"])
+    assert "Nothing is missing" in str(diagnosis_content(diagnosis)["statement"])
 
 
 @pytest.mark.parametrize(("seed", "cause"), [(102, "zero_jump"), (104, "gear_ripple"), (114, "scale_error")])
 def test_single_cause_is_named_where_it_is(tmp_path: Path, seed: int, cause: str) -> None:
     diagnosis, truth = run(tmp_path, seed, cause)
     effect = truth.plan.effects[0]
-    assert [f.family.cause for f in diagnosis.findings] == [cause]
+    assert [f.cause.name for f in diagnosis.findings] == [cause]
     assert diagnosis.findings[0].explained == pytest.approx(1.0)
-    assert diagnosis.findings[0].family.where == effect.where
+    assert diagnosis.findings[0].cause.where == effect.where
     before, after, floor = diagnosis.heldout
     assert after < before
     assert after < 1.15 * floor
@@ -59,23 +61,23 @@ def test_exchanged_targets_are_read_right(tmp_path: Path) -> None:
     diagnosis = diagnose(found.model, identify, found.names, (*found.eliminated, *own_elasticities(found)), verify)
     effect = truth.plan.effects[0]
     told = diagnosis.findings[0]
-    assert told.family.cause == "target_swapped"
-    assert {int(told.family.where), told.parameters["with"]} == {int(effect.where), int(effect.parameters["with"])}
+    assert told.cause.name == "target_swapped"
+    assert {int(told.cause.where), told.parameters["with"]} == {int(effect.where), int(effect.parameters["with"])}
     assert diagnosis.heldout[1] < 0.01 * diagnosis.heldout[0]
 
 
 def test_outside_the_library_is_unknown_and_still_modelled(tmp_path: Path) -> None:
     diagnosis, truth = run(tmp_path, 116, "damaged_tooth", snr=14.0)
     found = diagnosis.findings[0]
-    assert found.family.cause == "unknown"
-    assert found.family.where == truth.plan.effects[0].where
+    assert found.cause.name == "unknown"
+    assert found.cause.where == truth.plan.effects[0].where
     assert diagnosis.heldout[1] < diagnosis.heldout[0]
     assert found.parameters["term"]["formula"]
 
 
 def test_contract_is_plain_json(tmp_path: Path) -> None:
     diagnosis, _ = run(tmp_path, 102, "zero_jump")
-    content = json.loads(json.dumps(as_contract(diagnosis), allow_nan=False))
+    content = json.loads(json.dumps(diagnosis_content(diagnosis), allow_nan=False))
     assert content["format"] == "robcal/diagnosis-1"
     assert content["causes"][0]["parameters"]["pose"].startswith("p")
     assert {"before", "after", "noise_floor"} <= set(content["heldout_mm"])
@@ -91,31 +93,29 @@ def test_extended_model_predicts_better_where_nobody_measured(tmp_path: Path) ->
 
 def test_what_is_fitted_anyway_is_told_as_fitted_last(tmp_path: Path) -> None:
     diagnosis, _ = run(tmp_path, 8033, "stiffness_nonlinear", snr=20.0)
-    found = next(f for f in diagnosis.findings if f.family.cause == "stiffness_nonlinear")
-    name, unit = found.family.beside["linear_deg_per_kNm"]
+    found = next(f for f in diagnosis.findings if f.cause.name == "stiffness_nonlinear")
+    name, unit = found.cause.jointly_fitted["linear_deg_per_kNm"]
     assert found.parameters["linear_deg_per_kNm"] == pytest.approx(diagnosis.model.parameters[name] * unit)
     assert 0.0 < found.sigma["linear_deg_per_kNm"] < found.parameters["linear_deg_per_kNm"]
 
 
 def test_torque_that_acts_through_a_compliance_is_told_for_the_compliance_of_the_end() -> None:
     law, end, torque = 4e-6, 2e-6, np.array([30.0, 40.0])
-    family = Family(
-        "counterbalance",
-        "robot",
+    cause = LinearCause(
+        COUNTERBALANCE,
         "axis2",
         "y",
         ("cosine", "sine"),
         (1.0, 1.0),
         lambda v, c: {},
-        "",
-        through=("axis2.elastic_pitch", law),
+        scaled_by=("axis2.elastic_pitch", law),
     )
-    item = Accepted(family, {}, torque, np.zeros((2, 2)))
+    item = Accepted(cause, {}, torque, np.zeros((2, 2)))
     names = ("axis2.elastic_pitch", "axis2_counterbalance_0.cosine", "axis2_counterbalance_0.sine")
     covariance = np.diag([(0.1 * end) ** 2, 0.0, 0.0])
     model = SimpleNamespace(parameters={"axis2.elastic_pitch": end})
     final = SimpleNamespace(free=names, accepted=(item,), covariance=covariance, model=model)
-    values, spread = told_through(final, item, np.eye(2), 1.0)  # type: ignore[arg-type]
+    values, spread = rescaled(final, item, np.eye(2), 1.0)  # type: ignore[arg-type]
     # the same deflection through half the compliance takes twice the torque; a tenth of it is as uncertain
     assert np.allclose(values, 2.0 * torque)
     assert np.allclose(spread, 4.0 * np.eye(2) + 0.01 * np.outer(values, values))

@@ -1,4 +1,4 @@
-"""Family-wise level with the tails that residuals have."""
+"""LinearCause-wise level with the tails that residuals have."""
 
 from __future__ import annotations
 

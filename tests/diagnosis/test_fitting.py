@@ -11,9 +11,9 @@ import pytest
 from robcal.calibration.observations import DistanceObservations
 from robcal.diagnosis.core import fitting
 from robcal.diagnosis.core.fitting import Accepted, fit
-from robcal.diagnosis.diagnose import recording_data
+from robcal.diagnosis.findings import recording_data
 from robcal.diagnosis.gain.heldout import position_errors, rms
-from robcal.physics.measuring import measuring_families
+from robcal.physics.measuring import measuring_causes
 from tests.diagnosis.recordings import concealed
 
 
@@ -28,12 +28,12 @@ def test_a_displacement_that_the_robot_nearly_absorbs_is_followed_all_the_way(
     offset = replace(identify, observations=replace(identify.observations, distance=length + 0.2))
     # first the robot imitates the offset as far as it can, then the offset is known as such
     imitation = fit(found.model, offset, found.names)
-    families = measuring_families(recording_data(imitation, offset), (), "")
-    family = next(f for f in families if f.cause == "wire_offset")
-    accepted = Accepted(family, {}, np.zeros(1), np.zeros((1, 1)))
-    told = fit(imitation.model, offset, found.names, (accepted,))
-    assert abs(told.accepted[0].values[0] - 0.2) < 4 * float(np.sqrt(told.accepted[0].covariance[0, 0]))
-    assert rms(position_errors(offset, told)) < 1.01 * rms(position_errors(identify, plain))
-    own = told.columns_of(told.accepted[0])
-    assert np.array_equal(told.covariance[np.ix_(own, own)], told.accepted[0].covariance)
-    assert told.jacobian[:, own].shape == (len(told.residual), 1)
+    causes = measuring_causes(recording_data(imitation, offset), (), "")
+    cause = next(f for f in causes if f.name == "wire_offset")
+    accepted = Accepted(cause, {}, np.zeros(1), np.zeros((1, 1)))
+    reported = fit(imitation.model, offset, found.names, (accepted,))
+    assert abs(reported.accepted[0].values[0] - 0.2) < 4 * float(np.sqrt(reported.accepted[0].covariance[0, 0]))
+    assert rms(position_errors(offset, reported)) < 1.01 * rms(position_errors(identify, plain))
+    own = reported.columns_of(reported.accepted[0])
+    assert np.array_equal(reported.covariance[np.ix_(own, own)], reported.accepted[0].covariance)
+    assert reported.jacobian[:, own].shape == (len(reported.residual), 1)

@@ -47,7 +47,7 @@ def test_two_columns_that_say_the_same_are_one() -> None:
 
 
 def with_shared_errors(recording: Recording, count: int, sigma: float) -> Recording:
-    """The recording with `count` errors that all poses share in it, and told to it."""
+    """The recording with `count` errors that all poses share in it, and reported to it."""
     rng = np.random.default_rng(8)
     observed = recording.observations
     columns = sigma * rng.normal(size=(len(observed.pose), 3, count)) / np.sqrt(count)
@@ -60,10 +60,10 @@ def test_shared_errors_that_are_known_are_no_noise(tmp_path: Path, count: int) -
     found, identify, _, _ = concealed(tmp_path, seed=11, effects=[], noise=Measured(0.06, 0.006), poses=40)
     least = len(identify.observations.pose) * 3 - len(found.names)
     shared = with_shared_errors(identify, min(count, least + 5), 1.5e-4)
-    told = estimate_noise(found.model, shared, found.names)
+    reported = estimate_noise(found.model, shared, found.names)
     untold = estimate_noise(found.model, replace(shared, common=None), found.names)
-    assert told.factor == pytest.approx(1.0, abs=0.35)
-    assert untold.factor > 2.0 * told.factor
+    assert reported.factor == pytest.approx(1.0, abs=0.35)
+    assert untold.factor > 2.0 * reported.factor
 
 
 def test_repeatability_of_the_joints_is_told_from_the_factor(tmp_path: Path) -> None:

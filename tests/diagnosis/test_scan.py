@@ -36,8 +36,8 @@ def test_what_the_model_absorbs_is_not_tested(seed: int) -> None:
     absorbed = Entry(99, 0, basis[:, :2] @ np.array([[3.0, 1.0], [0.0, 2.0]]))
     stacks = stack_entries([*entries, absorbed], basis)
     result = scan(stacks, remove(basis, np.random.default_rng(seed).normal(size=(ROWS, 1)))[:, 0], ROWS - PARAMETERS)
-    assert result.count[result.family == 99] == 0
-    assert result.log_evidence[result.family == 99] == -np.inf
+    assert result.count[result.cause == 99] == 0
+    assert result.log_evidence[result.cause == 99] == -np.inf
 
 
 @given(st.integers(0, 1000))
@@ -46,8 +46,8 @@ def test_statistic_is_the_drop_of_the_square_sum(seed: int) -> None:
     basis, entries = problem(seed)
     r = remove(basis, np.random.default_rng(seed + 1).normal(size=(ROWS, 1)))[:, 0]
     result = scan(stack_entries(entries, basis), r, ROWS - PARAMETERS)
-    for family, chi2 in zip(result.family, result.chi2, strict=True):
-        full = np.column_stack([basis, entries[family].columns])
+    for cause, chi2 in zip(result.cause, result.chi2, strict=True):
+        full = np.column_stack([basis, entries[cause].columns])
         left = r - full @ np.linalg.lstsq(full, r, rcond=None)[0]
         assert np.isclose(chi2 * result.variance_factor, r @ r - left @ left, rtol=1e-8, atol=1e-9)
 

@@ -33,7 +33,7 @@ def test_a_base_off_the_plumb_line_acts_through_it(tmp_path: Path) -> None:
     found, identify, verify, truth = concealed(tmp_path, seed=10073, effects=["base_tilt"], snr=10.0)
     result = run(found, identify, verify)
     (finding,) = result.findings
-    assert finding.family.cause == "base_tilt"
+    assert finding.cause.name == "base_tilt"
     tilt = truth.plan.effects[0].parameters["tilt_deg"]
     assert abs(float(str(finding.parameters["tilt_deg"])) - tilt) < 4.0 * float(str(finding.sigma["tilt_deg"]))
     assert "axis1.elastic_yaw" in result.free

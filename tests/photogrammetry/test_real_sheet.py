@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import yaml
 
-from robcal.photogrammetry.bundle.adjustment import AdjustSettings
+from robcal.photogrammetry.bundle.settings import AdjustSettings
 from robcal.photogrammetry.core.camera import Camera
 from robcal.photogrammetry.core.network import Lengths
 from robcal.photogrammetry.survey.survey import BodyTarget, SurveyImage, SurveySettings, survey_body

@@ -52,7 +52,7 @@ def test_chessboard(files):
     assert abs(o.cameras[1].fx - 535) < 5
     baseline = np.linalg.norm(o.world_T_camera["right"][:3, 3])
     assert abs(baseline - 0.08289) < 0.0002
-    radial = {e.where for e in o.evidence if e.kind == "lens_radial"}
+    radial = {e.where for e in o.evidence if e.name == "lens_radial"}
     assert radial == ({"left", "right"} if files else set())
     f = measure_frames(measure_points(o, marks), body)
     assert len(f.pose) == 13

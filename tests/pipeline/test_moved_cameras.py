@@ -22,6 +22,7 @@ from robcal.calibration.calibrated import CalibratedRobot
 from robcal.diagnosis.images.camera_moves import epochs_of
 from robcal.diagnosis.images.diagnosis import ImageFinding
 from robcal.diagnosis.search.selection import SelectionSettings
+from robcal.physics.library import kinds
 from robcal.recipe.recording import common_errors
 from robcal.recipe.robot_diagnosis import settings_beside
 from robcal.recipe.verification import datum_note
@@ -40,7 +41,7 @@ def test_small_move_is_told_and_the_robot_tells_which_of_two_cameras(tmp_path: P
     make_own(tmp_path / "campaign", effects=[effect], **PLAN)
     run_campaign(tmp_path / "campaign", tmp_path / "run", until="identify")
     station = Run(tmp_path / "run").load("orient")
-    (item,) = [e for e in station.evidence if e.kind == "camera_moved"]
+    (item,) = [e for e in station.evidence if e.name == "camera_moved"]
     assert item.where == camera
     assert item.alone
     assert abs(item.pose - effect.value("index")) <= 3
@@ -92,7 +93,7 @@ def test_moved_base_may_be_moved_cameras(tmp_path: Path) -> None:
 
 def test_robot_is_judged_sternly_beside_uncorrected_causes_in_images() -> None:
     def found(cause: str) -> ImageFinding:
-        return ImageFinding(cause, "camera", "left", None, {}, {}, 1e-9, (), (1.0, 0.5), "")
+        return ImageFinding(kinds()[cause], "left", None, {}, {}, 1e-9, (), (1.0, 0.5), "")
 
     plain = SelectionSettings()
     assert settings_beside(plain, [found("lens_radial"), found("camera_moved")]) == plain

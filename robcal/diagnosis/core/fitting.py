@@ -9,8 +9,8 @@ import numpy as np
 
 from robcal.diagnosis.core.recording import Recording, observation_data
 from robcal.diagnosis.scan.statistics import orthonormal_basis
-from robcal.physics.cause import Array, Constants, Family
-from robcal.physics.prior_scale import usual_sizes
+from robcal.physics.cause import Array, Constants, LinearCause, ObservationCause
+from robcal.physics.prior_scale import prior_scales
 from robcal.robot.kernel import Kernel, PoseInputs
 from robcal.robot.kernel_cache import kernel_of
 from robcal.robot.model import RobotModel, Term
@@ -22,7 +22,7 @@ MOST_FREE = 12
 TERM_PARTS = 24
 """Amplitudes in one expression of the kernel, which may not grow without end."""
 RELEASE = 4.0
-"""Factor by which steps may grow after one that lowered the square sum."""
+"""Factor by which steps may grow after one that lowered the sum of squares."""
 LARGEST_STEP = 5.0
 """Largest step of a parameter that makes sense, in its usual sizes."""
 MANY = 120
@@ -31,9 +31,9 @@ MANY = 120
 
 @dataclass(frozen=True)
 class Accepted:
-    """A family with constants that is part of the model, and its amplitudes (SI)."""
+    """A cause with constants that is part of the model, and its amplitudes (SI)."""
 
-    family: Family
+    cause: LinearCause
     constants: Constants
     values: Array
     covariance: Array
@@ -41,15 +41,15 @@ class Accepted:
     @property
     def names(self) -> tuple[str, ...]:
         """Short names of the amplitudes."""
-        return self.family.names(self.constants)
+        return self.cause.names(self.constants)
 
     def term(self, number: int) -> str:
         """Name of its term in the kernel, as the cause of that number."""
-        return f"{self.family.where}_{self.family.cause}_{number}"
+        return f"{self.cause.where}_{self.cause.name}_{number}"
 
     def full_names(self, number: int) -> tuple[str, ...]:
         """Names of the kernel's parameters that are the amplitudes of a robot cause."""
-        return self.family.frees or tuple(f"{self.term(number)}.{short}" for short in self.names)
+        return self.cause.free_parameters or tuple(f"{self.term(number)}.{short}" for short in self.names)
 
 
 @dataclass(frozen=True)
@@ -86,9 +86,9 @@ class Fit:
     def columns_of(self, item: Accepted) -> Array:
         """Columns of `jacobian` that belong to the amplitudes of one of the accepted causes."""
         number = next(k for k, other in enumerate(self.accepted) if other is item)
-        if item.family.displace is None:
+        if not isinstance(item.cause, ObservationCause):
             return np.array([self.free.index(name) for name in item.full_names(number)], dtype=np.intp)
-        before = [len(other.names) for other in self.accepted[:number] if other.family.displace is not None]
+        before = [len(other.names) for other in self.accepted[:number] if isinstance(other.cause, ObservationCause)]
         return np.arange(len(item.names), dtype=np.intp) + len(self.free) + sum(before)
 
     @property
@@ -104,17 +104,15 @@ class Fit:
 
 def terms_of(accepted: Accepted, number: int) -> tuple[Term, ...]:
     """Terms of the kernel for an accepted robot cause; amplitudes as its parameters."""
-    family = accepted.family
-    if family.bases is None:
-        return ()
+    cause = accepted.cause
     name = accepted.term(number)
     values = dict(zip(accepted.names, map(float, accepted.values), strict=True))
     groups: dict[tuple[str, str], list[tuple[str, str]]] = {}
-    for basis in family.bases(accepted.constants):
+    for basis in cause.laws(accepted.constants):
         groups.setdefault((basis.frame, basis.kind), []).append((basis.parameter, basis.expression))
     sizes: dict[str, float] = {}
     if len(accepted.names) > MOST_FREE:
-        sizes = dict(zip(accepted.names, map(float, family.sizes(accepted.constants)), strict=True))
+        sizes = dict(zip(accepted.names, map(float, cause.sizes(accepted.constants)), strict=True))
     return tuple(
         Term(
             name,
@@ -123,7 +121,7 @@ def terms_of(accepted: Accepted, number: int) -> tuple[Term, ...]:
             " + ".join(f"{p}*({expression})" for p, expression in parts[k : k + TERM_PARTS]),
             {p: values[p] for p, _ in parts[k : k + TERM_PARTS]},
             priors={p: sizes[p] for p, _ in parts[k : k + TERM_PARTS] if p in sizes},
-            cause=family.cause,
+            cause=cause.name,
         )
         for (frame, kind), parts in groups.items()
         for k in range(0, len(parts), TERM_PARTS)
@@ -147,12 +145,12 @@ def fit(
         model = model.with_terms(terms_of(item, number))
     kernel = kernel_of(model, statics)
     inputs = recording.inputs(kernel)
-    names = list(dict.fromkeys([*free, *(n for a in accepted for n in a.family.frees)]))
+    names = list(dict.fromkeys([*free, *(n for a in accepted for n in a.cause.free_parameters)]))
     names += [full for term in model.terms for full in term.parameter_names if full not in names]
     position = {name: i for i, name in enumerate(kernel.names)}
     columns = np.array([position[name] for name in names])
     theta = np.array(kernel.theta0, dtype=float)
-    direct = [item for item in accepted if item.family.displace is not None]
+    direct = [item for item in accepted if isinstance(item.cause, ObservationCause)]
     obs = recording.observations
 
     def linearised() -> tuple[Array, Array, Array]:
@@ -160,7 +158,11 @@ def fit(
         residual, jacobian = recording.linearise(frames, J)
         if direct:
             data = observation_data(recording, frames, kernel.variables(theta, inputs))
-            shifts = [item.family.displace(data, item.constants) for item in direct if item.family.displace is not None]
+            shifts = [
+                item.cause.observation_shift(data, item.constants)
+                for item in direct
+                if isinstance(item.cause, ObservationCause)
+            ]
             jacobian = np.concatenate([jacobian, *(recording.whiten(shift, frames) for shift in shifts)], axis=1)
         return frames, residual, jacobian
 
@@ -221,14 +223,14 @@ def fit(
 
 
 def _least(residual: Array, columns: Array) -> float:
-    """Square sum (of whitened rows) that is left beside displacements of observations."""
+    """sum of squares (of whitened rows) that is left beside displacements of observations."""
     left = residual - columns @ solve(columns, residual) if columns.shape[1] else residual
     return float(left @ left)
 
 
 def damping(names: Sequence[str], columns: int, variables: Mapping[str, Array]) -> Array:
     """Reciprocals (columns,) of the largest steps that make sense for named parameters; zero for amplitudes."""
-    largest = LARGEST_STEP * usual_sizes(names, variables)
+    largest = LARGEST_STEP * prior_scales(names, variables)
     brakes = np.where(largest > 0, 1.0 / np.where(largest > 0, largest, 1.0), 0.0)
     return np.concatenate([brakes, np.zeros(columns - len(names))])
 
@@ -247,7 +249,7 @@ def _amplitudes(
     offset = 0
     for number, item in enumerate(accepted):
         width = len(item.names)
-        if item.family.displace is not None:
+        if isinstance(item.cause, ObservationCause):
             where = np.arange(first_direct + offset, first_direct + offset + width)
             values = linear[offset : offset + width]
             offset += width

@@ -38,7 +38,7 @@ class Recording:
     shared : repeatability of the joints as estimated.
     common : (m_obs, 3 | 6, k) displacements of points or frames by one
         standard deviation of errors common to all poses (orientation of the station, coordinates of the body).
-    own_station : measured by cameras whose own images are diagnosed: their moves are told from those.
+    own_station : measured by cameras whose own images are diagnosed: their moves are reported from those.
     """
 
     q: Array
@@ -166,7 +166,7 @@ def _rows(observations: SpatialObservations, keep: Array) -> SpatialObservations
 
 
 def observation_data(recording: Recording, frames: Array, variables: Mapping[str, Array]) -> ObservationData:
-    """What observation families need, at the modelled frames (n, 4, 4)."""
+    """What observation causes need, at the modelled frames (n, 4, 4)."""
     obs = recording.observations
     m = len(obs.pose)
     T = frames[obs.pose]

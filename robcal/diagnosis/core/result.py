@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from robcal.physics.cause import Array, Constants, Family
+from robcal.physics.cause import Array, Constants, LinearCause
 from robcal.robot.model import RobotModel
 
 
@@ -19,7 +19,7 @@ class Rival:
     overlap : share of the named cause's projected signature that the rival can reproduce, 0 to 1.
     """
 
-    family: Family
+    cause: LinearCause
     constants: Constants
     probability: float
     overlap: float
@@ -31,29 +31,29 @@ class Finding:
 
     Attributes
     ----------
-    values, covariance : amplitudes in SI, in the order of the family's names.
-    parameters, sigma : as reported, in the contract's units.
+    values, covariance : amplitudes in SI, in the order of the cause's names.
+    parameters, sigma : as reported, in the units of diagnosis.json.
     p_value : family-wise probability of the scan in which it was found.
     log_evidence : logarithm of the Bayes factor against leaving it out.
     rivals : the rest of the 95 % set and every cause with the same signature.
-    explained : its share, 0 to 1, of the drop of the whitened square sum by all causes, added in their order.
+    explained : its share, 0 to 1, of the drop of the whitened sum of squares by all causes, added in their order.
     poses : names of the poses that carry most of it.
     heldout : position error on kept-out poses in metres, before and after adding it.
     """
 
-    family: Family
+    cause: LinearCause
     constants: Constants
     values: Array
     covariance: Array
     parameters: Mapping[str, object]
-    sigma: Mapping[str, object]
     p_value: float
     log_evidence: float
-    rivals: tuple[Rival, ...]
-    explained: float
-    poses: tuple[str, ...]
     heldout: tuple[float, float]
     statement: str
+    sigma: Mapping[str, object] = field(default_factory=dict)
+    rivals: tuple[Rival, ...] = ()
+    explained: float = 1.0
+    poses: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

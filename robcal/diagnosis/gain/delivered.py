@@ -15,7 +15,7 @@ from robcal.calibration.identifiability import repetitions
 from robcal.diagnosis.core.fitting import Fit, solve
 from robcal.diagnosis.core.recording import Recording
 from robcal.diagnosis.gain.heldout import folds
-from robcal.physics.cause import Array
+from robcal.physics.cause import Array, ObservationCause
 from robcal.robot.kernel import PoseInputs
 from robcal.robot.model import GEOMETRIC_KINDS
 
@@ -54,7 +54,7 @@ def delivered_errors(
     cell = [f"{end}.{kind}" for end in ("base", "tool") for kind in GEOMETRIC_KINDS]
     own = [k for k, name in enumerate(fitted.free) if name in cell]
     displaced = fitted.jacobian[:, len(columns) :]
-    direct = [item.values for item in fitted.accepted if item.family.displace is not None]
+    direct = [item.values for item in fitted.accepted if isinstance(item.cause, ObservationCause)]
     amplitudes = np.concatenate(direct) if direct else np.zeros(0)
     fold_of_row = labels[fitted.row_pose]
     left = np.empty(len(residual))

@@ -9,7 +9,7 @@ import numpy as np
 from robcal.calibration.observations import DistanceObservations, FrameObservations, PointObservations
 from robcal.diagnosis.core.fitting import Accepted, Fit, solve
 from robcal.diagnosis.core.recording import Recording, observation_data
-from robcal.physics.cause import Array
+from robcal.physics.cause import Array, ObservationCause
 from robcal.transforms import invert, transform
 
 FOLDS = 8
@@ -37,8 +37,11 @@ def position_errors(recording: Recording, fitted: Fit, accepted: Sequence[Accept
         error = error - (recording.common @ fitted.common)[:, :3]
     variables = kernel.variables(fitted.theta, inputs)
     for item in fitted.accepted if accepted is None else accepted:
-        if item.family.displace is not None:
-            shift = item.family.displace(observation_data(recording, frames, variables), item.constants) @ item.values
+        if isinstance(item.cause, ObservationCause):
+            shift = (
+                item.cause.observation_shift(observation_data(recording, frames, variables), item.constants)
+                @ item.values
+            )
             if isinstance(obs, PointObservations):
                 error = error - shift
             elif isinstance(obs, FrameObservations):

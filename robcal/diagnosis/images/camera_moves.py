@@ -13,10 +13,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from robcal.diagnosis.images.data import ImageData
 from robcal.diagnosis.images.diagnosis import diagnose_images
 from robcal.errors import RobcalError
-from robcal.photogrammetry.station.network import Evidence, StationOrientation, StationSettings, movement
+from robcal.photogrammetry.station.contradictions import CAMERA_MOVED
+from robcal.photogrammetry.station.network import StationCause, StationOrientation, StationSettings, movement
+from robcal.physics.images.data import ImageData
 
 MOST = 3
 BEYOND_DOUBT = 1e4
@@ -43,15 +44,15 @@ def with_small_moves(
     """
     if len(orientation.names) < 2:
         return orientation, orient
-    moved = [e for e in orientation.evidence if e.kind == "camera_moved"]
+    moved = [e for e in orientation.evidence if e.kind.moves == "camera"]
     if moved and max(e.statistic for e in moved) < BEYOND_DOUBT:
         at_rest = orient(StationSettings(detect_moves=False))
-        causes = {f.cause for f in diagnose_images(data(at_rest)).findings}
-        if causes and "camera_moved" not in causes:
+        causes = {f.kind for f in diagnose_images(data(at_rest)).findings}
+        if causes and CAMERA_MOVED not in causes:
             return at_rest, lambda settings: orient(replace(settings, detect_moves=False))
     for _ in range(MOST):
         view = data(orientation)
-        found = next((f for f in diagnose_images(view).findings if f.cause == "camera_moved"), None)
+        found = next((f for f in diagnose_images(view).findings if f.kind == CAMERA_MOVED), None)
         if found is None:
             break
         pose = int(orientation.poses[view.image_names.index(str(found.parameters["pose"]))])
@@ -77,32 +78,34 @@ def _with(epochs: Mapping[str, tuple[int, ...]], camera: str, pose: int) -> dict
 def _oriented(orient: Orient, before: StationOrientation, epochs: Mapping[str, tuple[int, ...]]) -> StationOrientation:
     """The station oriented with known epochs; they are evidence like the ones that the adjustment finds itself."""
     after = orient(StationSettings(epochs={name: poses for name, poses in epochs.items() if poses}))
-    told = {(e.where, e.pose) for e in after.evidence if e.kind == "camera_moved"}
+    reported = {(e.where, e.pose) for e in after.evidence if e.kind.moves == "camera"}
     known = [
         moved_evidence(after, name, pose)
         for name, poses in epochs.items()
         for pose in poses
-        if (name, pose) not in told
+        if (name, pose) not in reported
     ]
     return replace(after, evidence=(*known, *after.evidence))
 
 
-def moved_evidence(orientation: StationOrientation, camera: str, pose: int) -> Evidence:
+def moved_evidence(orientation: StationOrientation, camera: str, pose: int) -> StationCause:
     """How a camera stands from a pose on against before, from its adjusted exterior orientations."""
     shift, covariance = orientation.movement(camera, pose)
     statistic = float(shift @ np.linalg.pinv(covariance, rcond=1e-9, hermitian=True) @ shift)
-    return Evidence("camera_moved", camera, pose, shift, covariance, statistic, 6, movement(camera, pose, shift))
+    return StationCause(
+        CAMERA_MOVED, camera, None, pose, shift, covariance, statistic, 6, movement(camera, pose, shift)
+    )
 
 
 def which_moved(orientation: StationOrientation, orient: Orient, misfit_of: Misfit) -> StationOrientation:
-    """Of two cameras the one that really moved, as the robot tells; `Evidence.alone` where it can.
+    """Of two cameras the one that really moved, as the robot tells; `StationCause.alone` where it can.
 
     Each movement is tried on both cameras, one after the other; ``misfit_of`` is what the robot leaves with a station.
     """
     if len(orientation.names) != 2:
         return orientation
     misfit = misfit_of(orientation)
-    for item in [e for e in orientation.evidence if e.kind == "camera_moved"]:
+    for item in [e for e in orientation.evidence if e.kind.moves == "camera"]:
         if misfit is None or item.pose is None:
             break
         epochs = epochs_of(orientation)
@@ -119,8 +122,8 @@ def which_moved(orientation: StationOrientation, orient: Orient, misfit_of: Misf
         alone = abs(rival[0] - misfit[0]) > DECIDED * max(1.0, best[0] / max(best[1], 1))
         better, name = (second, other) if rival < misfit else (orientation, item.where)
         misfit = best
-        told = tuple(
+        reported = tuple(
             replace(e, alone=e.alone or (alone and (e.where, e.pose) == (name, item.pose))) for e in better.evidence
         )
-        orientation = replace(better, evidence=told)
+        orientation = replace(better, evidence=reported)
     return orientation

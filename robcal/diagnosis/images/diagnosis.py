@@ -8,9 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import stats
 
-from robcal.diagnosis.images.cause import ImageCause
-from robcal.diagnosis.images.causes import image_causes, neighbouring_moves
-from robcal.diagnosis.images.data import ImageData
+from robcal.cause import Cause, Kind
 from robcal.diagnosis.scan.family_wise import FamilyWise, simulate
 from robcal.diagnosis.scan.statistics import (
     Entry,
@@ -21,7 +19,10 @@ from robcal.diagnosis.scan.statistics import (
     scan,
     stack_entries,
 )
-from robcal.physics.cause import Array, Constants, numeric_sigma
+from robcal.physics.cause import Array, numeric_sigma
+from robcal.physics.images.cause import ImageCause
+from robcal.physics.images.causes import image_causes, neighbouring_moves
+from robcal.physics.images.data import ImageData
 
 LEVEL = 0.002
 """Family-wise level. Marks share small errors that their covariance does not know, and a robot's own diagnosis adds its
@@ -39,21 +40,17 @@ not hold."""
 
 
 @dataclass(frozen=True)
-class ImageFinding:
-    """A cause found in images, in the contract's terms.
+class ImageFinding(Cause):
+    """A cause found in images, as reported.
 
-    `rivals` are (cause, where) of others that explain the images (nearly) as well; `heldout_px` the root mean square
+    `rivals` are (kind, where) of others that explain the images (nearly) as well; `heldout_px` the root mean square
     of the marks, each predicted without itself, before and after.
     """
 
-    cause: str
-    stage: str
-    where: str
-    direction: str | None
     parameters: dict[str, object]
     sigma: dict[str, object]
     p_value: float
-    rivals: tuple[tuple[str, str], ...]
+    rivals: tuple[tuple[Kind, str], ...]
     heldout_px: tuple[float, float]
     statement: str
 
@@ -78,14 +75,14 @@ class _Accepted:
     covariance: Array
     inflation: float
     p_value: float
-    rivals: tuple[tuple[str, str], ...]
+    rivals: tuple[tuple[Kind, str], ...]
     heldout_px: tuple[float, float]
 
 
 def diagnose_images(data: ImageData, *, moves: bool = True, level: float = LEVEL, seed: int = 0) -> ImageDiagnosis:
     """Find what the model of the images leaves out.
 
-    Weakness: everything is linear in the parameters of a cause; a strong effect is told right in kind and place, its
+    Weakness: everything is linear in the parameters of a cause; a strong effect is right in kind and place, its
     size to first order only.
     """
     causes = list(image_causes(data, moves))
@@ -130,7 +127,7 @@ def diagnose_images(data: ImageData, *, moves: bool = True, level: float = LEVEL
         gained = after <= (1.0 - cause.least_gain) * predicted
         if not (cause.plausible(values) and gained and _adequate(fields, cause, basis, residual, freedom)):
             dropped_p = min(dropped_p, last_p)
-            listed = [entry for entry in listed if entry.family != chosen]
+            listed = [entry for entry in listed if entry.cause != chosen]
             continue
         residual, redundancy = left, remaining
         rivals = _rivals(causes, score, chosen)
@@ -139,15 +136,15 @@ def diagnose_images(data: ImageData, *, moves: bool = True, level: float = LEVEL
             _Accepted(cause, columns, values, covariance, float(inflation[chosen]), last_p, rivals, (predicted, after))
         )
         if cause.once:
-            same = {i for i, c in enumerate(causes) if (c.cause, c.where) == (cause.cause, cause.where)}
-            listed = [entry for entry in listed if entry.family not in same]
+            same = {i for i, c in enumerate(causes) if (c.kind, c.where) == (cause.kind, cause.where)}
+            listed = [entry for entry in listed if entry.cause not in same]
         predicted = after
         added = np.concatenate([added, basis], axis=1)
     findings = [f for item in _together(accepted, data, residual) for f in _findings(item)]
     left_over = min(last_p, dropped_p)
     if left_over < ADEQUATE:
         # images that are bent in a manner which nothing explains make single targets look displaced
-        findings = [f for f in findings if f.cause != "target_shifted" or f.p_value < left_over]
+        findings = [f for f in findings if f.kind.moves != "target" or f.p_value < left_over]
     floor = data.sigma_px
     p_value = findings[0].p_value if findings else last_p
     return ImageDiagnosis(tuple(findings), p_value, left_over, (before, predicted, floor))
@@ -179,23 +176,13 @@ def _together(accepted: Sequence[_Accepted], data: ImageData, residual: Array) -
 
 
 def _findings(item: _Accepted) -> Iterator[ImageFinding]:
-    """A cause as told, at each of its places."""
+    """A cause as reported, at each of its places."""
     cause = item.cause
-    told = cause.report(item.values)
-    sigma = _sigma(cause, item.values, item.covariance * item.inflation)
-    for where in cause.told_of:
-        text = _sentence(cause, told, where)
+    reported, sigma = numeric_sigma(cause.report, item.values, {}, item.covariance * item.inflation)
+    for where in cause.locations:
+        text = cause.describe(where, reported)
         yield ImageFinding(
-            cause.cause,
-            cause.stage,
-            where,
-            cause.direction,
-            told,
-            sigma,
-            item.p_value,
-            item.rivals,
-            item.heldout_px,
-            text,
+            cause.kind, where, cause.direction, reported, sigma, item.p_value, item.rivals, item.heldout_px, text
         )
 
 
@@ -204,7 +191,7 @@ def _adequate(fields: Mapping[str, Array], cause: ImageCause, basis: Array, resi
 
     What a lens model leaves over looks partly like refraction; the name holds only if it explains (nearly) all of it.
     """
-    known = [fields[name] for name in cause.told_of if name in fields]
+    known = [fields[name] for name in cause.locations if name in fields]
     if not cause.bends or not known:
         return True
     explained = float(np.sum((basis.T @ residual) ** 2))
@@ -221,8 +208,8 @@ def _fields(causes: Sequence[ImageCause], stacks: Sequence[Stack]) -> dict[str, 
     return {
         causes[index].where: stack.basis[e]
         for stack in stacks
-        for e, index in enumerate(stack.family)
-        if causes[index].cause == "unknown" and stack.count[e] > 0
+        for e, index in enumerate(stack.cause)
+        if not causes[index].kind.named and stack.count[e] > 0
     }
 
 
@@ -232,9 +219,9 @@ def _inflation(causes: Sequence[ImageCause], stacks: Sequence[Stack], data: Imag
     Errors that the marks of an image (or of a target) have in common make every image and every target look
     displaced; only what stands out from the others is one. The median is hardly moved by the few that are.
     """
-    factor = np.array([data.inflation.get(cause.cause, 1.0) for cause in causes])
-    shifted = np.array([cause.cause == "target_shifted" for cause in causes])
-    bases = [stack.basis[e] for stack in stacks for e in np.flatnonzero(shifted[stack.family] & (stack.count > 0))]
+    factor = np.array([data.inflation.get(cause.name, 1.0) for cause in causes])
+    shifted = np.array([cause.kind.moves == "target" for cause in causes])
+    bases = [stack.basis[e] for stack in stacks for e in np.flatnonzero(shifted[stack.cause] & (stack.count > 0))]
     if bases:
         factor[shifted] = max(1.0, spread_of_others(bases, residual))
     return factor
@@ -257,7 +244,7 @@ def spread_of_others(bases: Sequence[Array], residual: Array) -> float:
 
 def _scaled(stack: Stack, inflation: Array) -> Stack:
     """The stack with scores divided by the root of their inflation."""
-    root = np.sqrt(inflation[stack.family])
+    root = np.sqrt(inflation[stack.cause])
     return replace(stack, basis=stack.basis / root[:, None, None], singular=stack.singular / root[:, None])
 
 
@@ -275,7 +262,7 @@ def _predicted(data: ImageData, residual: Array, redundancy: Array) -> float:
 def _best(causes: Sequence[ImageCause], result: ScanResult, level_of: FamilyWise, level: float) -> tuple[int, Array]:
     """Candidate with the most evidence, and log-odds (causes,) of all; what is not significant itself is none."""
     score = np.full(len(causes), -np.inf)
-    for index, evidence, log_p in zip(result.family, result.log_evidence, result.log_p, strict=True):
+    for index, evidence, log_p in zip(result.cause, result.log_evidence, result.log_p, strict=True):
         if level_of.probability(float(log_p)) <= level:
             score[index] = evidence + np.log(causes[index].weight)
     return int(np.argmax(score)), score
@@ -285,7 +272,7 @@ def _estimate(
     stacks: Sequence[Stack], chosen: int, residual: Array, variance: float, sizes: Array
 ) -> tuple[Array, Array, Array]:
     for stack in stacks:
-        for e in np.flatnonzero(stack.family == chosen):
+        for e in np.flatnonzero(stack.cause == chosen):
             seen = stack.singular[e] > 0
             basis = stack.basis[e][:, seen]
             right = stack.right[e][seen]
@@ -296,20 +283,8 @@ def _estimate(
     raise LookupError("the chosen cause is not among the tested ones")
 
 
-def _sigma(cause: ImageCause, values: Array, covariance: Array) -> dict[str, object]:
-    def report(v: Array, _: Constants) -> dict[str, object]:
-        return cause.report(v)
-
-    return numeric_sigma(report, values, {}, covariance)[1]
-
-
-def _rivals(causes: Sequence[ImageCause], score: Array, chosen: int) -> tuple[tuple[str, str], ...]:
-    own = {(causes[chosen].cause, where) for where in causes[chosen].told_of}
-    near = [i for i in np.argsort(-score) if score[i] > score[chosen] - NEARLY_AS_GOOD and causes[i].cause != "unknown"]
-    listed = dict.fromkeys([*causes[chosen].twins, *((causes[i].cause, w) for i in near for w in causes[i].told_of)])
+def _rivals(causes: Sequence[ImageCause], score: Array, chosen: int) -> tuple[tuple[Kind, str], ...]:
+    own = {(causes[chosen].kind, where) for where in causes[chosen].locations}
+    near = [i for i in np.argsort(-score) if score[i] > score[chosen] - NEARLY_AS_GOOD and causes[i].kind.named]
+    listed = dict.fromkeys([*causes[chosen].twins, *((causes[i].kind, w) for i in near for w in causes[i].locations)])
     return tuple(rival for rival in listed if rival not in own)
-
-
-def _sentence(cause: ImageCause, told: dict[str, object], where: str) -> str:
-    shown = {k: ", ".join(f"{x:.3f}" for x in v) if isinstance(v, list) else v for k, v in told.items()}
-    return cause.sentence.format(where=where, **shown)

@@ -12,13 +12,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from robcal.diagnosis.images.data import ImageData
 from robcal.diagnosis.images.diagnosis import ImageFinding, diagnose_images
 from robcal.photogrammetry.core.bodies import Body
+from robcal.physics.images.cause import ECCENTRICITY
+from robcal.physics.images.data import ImageData
 
-CAUSE = "ellipse_eccentricity"
 PRECISE = 3.0
-"""Diameters below this multiple of their standard deviation are told, but not taken over."""
+"""Diameters below this multiple of their standard deviation are reported, but not taken over."""
 
 
 def with_dot_sizes(body: Body, view: Callable[[], ImageData]) -> tuple[Body, tuple[ImageFinding, ...]]:
@@ -34,7 +34,7 @@ def with_dot_sizes(body: Body, view: Callable[[], ImageData]) -> tuple[Body, tup
     """
     if np.any(np.isfinite(body.diameters)) or all(code == "corner" for code in body.codes):
         return body, ()
-    found = tuple(f for f in diagnose_images(view()).findings if f.cause == CAUSE)
+    found = tuple(f for f in diagnose_images(view()).findings if f.kind == ECCENTRICITY)
     if not found:
         return body, ()
     value, sigma = (float(str(table["diameter_mm"])) for table in (found[0].parameters, found[0].sigma))

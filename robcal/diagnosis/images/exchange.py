@@ -1,4 +1,4 @@
-"""Targets of a station that carry each other's number, told by the marks that the orientation had to leave out."""
+"""Targets of a station that carry each other's number, reported by the marks that the orientation had to leave out."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from scipy import stats
 from robcal.diagnosis.images.diagnosis import ImageFinding
 from robcal.photogrammetry.core.bodies import Body
 from robcal.photogrammetry.core.camera import project
+from robcal.photogrammetry.station.contradictions import TARGET_SWAPPED
 from robcal.photogrammetry.station.network import StationMarks, StationOrientation
 from robcal.physics.cause import Array
 from robcal.transforms import invert, transform
@@ -55,11 +56,9 @@ def exchanged_targets(
         before = float(np.sqrt((kept * orientation.rms_px**2 + count * 0.5 * off**2) / (kept + count)))
         # sign test: all these marks lie nearer to the other target, which chance does in half of them
         p_value = float(stats.binom.sf(count - 1, count, 0.5))
-        text = f"Targets {first} and {second} are swapped: each is seen where the file has the other"
         found.append(
             ImageFinding(
-                "target_swapped",
-                "body",
+                TARGET_SWAPPED,
                 str(first),
                 None,
                 {"with": int(second)},
@@ -67,7 +66,7 @@ def exchanged_targets(
                 p_value,
                 (),
                 (before, orientation.rms_px),
-                text,
+                TARGET_SWAPPED.describe(str(first), {"with": second}),
             )
         )
     return tuple(found)

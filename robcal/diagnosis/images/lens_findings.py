@@ -1,4 +1,4 @@
-"""What surveys and stations found and corrected by themselves, told as causes: lens groups left out of a camera's file,
+"""What surveys and stations found and corrected by themselves, as causes: lens groups left out of a camera's file,
 cameras that moved, targets that sit elsewhere."""
 
 from __future__ import annotations
@@ -9,19 +9,16 @@ from dataclasses import replace
 import numpy as np
 from scipy import stats
 
+from robcal.cause import Kind
 from robcal.diagnosis.images.diagnosis import ImageFinding
 from robcal.photogrammetry.core.bodies import Body
 from robcal.photogrammetry.core.camera import INTRINSIC_NAMES, Camera
 from robcal.photogrammetry.core.network import CameraNetwork
-from robcal.photogrammetry.station.network import Evidence, StationOrientation
+from robcal.photogrammetry.station.contradictions import LENS_AFFINITY, LENS_KINDS, LENS_TANGENTIAL, TARGET_SWAPPED
+from robcal.photogrammetry.station.network import StationCause, StationOrientation
 from robcal.physics.cause import Array
+from robcal.physics.refraction import REFRACTION
 
-LENS_GROUPS: Mapping[str, tuple[str, ...]] = {
-    "lens_radial": ("k1", "k2", "k3"),
-    "lens_tangential": ("p1", "p2"),
-    "lens_affinity": ("fx", "fy"),
-}
-KIND = {"lens_radial": "radial distortion", "lens_tangential": "tangential distortion", "lens_affinity": "affinity"}
 LEVEL = 1e-4
 """Significance from which a lens group is a cause. Marks of an image share small errors, hence more than 1 %."""
 
@@ -44,8 +41,9 @@ def survey_findings(network: CameraNetwork, start: Camera | None, name: str) -> 
     found = []
     marks = len(network.marks)
     rms, alone = network.rms_px, _predicted(marks, network.redundancy_total)
-    for cause, group in LENS_GROUPS.items():
-        if cause == "lens_affinity":
+    for kind in LENS_KINDS:
+        group = kind.intrinsics
+        if kind == LENS_AFFINITY:
             given, contrast = start.fy - start.fx, _difference()
         else:
             given = float(np.abs([getattr(start, n) for n in group]).max())
@@ -63,24 +61,22 @@ def survey_findings(network: CameraNetwork, start: Camera | None, name: str) -> 
         before = float(np.sqrt(rms**2 + statistic * network.sigma0_px**2 / (2 * marks)))
         if p_value > LEVEL:
             continue
-        names = ["fy_minus_fx_px"] if cause == "lens_affinity" else [n for n in group if n in network.free_intrinsics]
-        told = dict(zip(names, map(float, values), strict=True))
+        names = ["fy_minus_fx_px"] if kind == LENS_AFFINITY else [n for n in group if n in network.free_intrinsics]
+        reported = dict(zip(names, map(float, values), strict=True))
         sigma = dict(zip(names, map(float, np.sqrt(np.diag(covariance))), strict=True))
-        text = f"The lens of camera '{name}' has {KIND[cause]} that its file leaves out"
         found.append(
             (
                 statistic,
                 ImageFinding(
-                    cause,
-                    "camera",
+                    kind,
                     name,
                     None,
-                    dict(told),
+                    dict(reported),
                     dict(sigma),
                     p_value,
                     (),
                     (alone * before, alone * rms),
-                    text,
+                    kind.describe(name, reported),
                 ),
             )
         )
@@ -116,29 +112,28 @@ def station_findings(
     marks = len(orientation.marks)
     rms, alone = orientation.rms_px, _predicted(marks, orientation.redundancy_total)
     for item in sorted(_with_swaps(orientation.evidence, given), key=lambda e: -e.statistic):
-        told, sigma, stage, text = _told(orientation, item, pose_names)
-        if told is None:
+        reported, sigma, text = _reported(orientation, item, pose_names)
+        if reported is None:
             continue
-        statistic = item.statistic / (inflation or {}).get(item.kind, 1.0)
+        statistic = item.statistic / (inflation or {}).get(item.name, 1.0)
         p_value = float(stats.chi2.sf(statistic, item.degrees))
-        if p_value > LEVEL or (item.kind == "target_shifted" and item.where in explained):
+        if p_value > LEVEL or (item.kind.moves == "target" and item.where in explained):
             continue
         before = float(np.sqrt(rms**2 * (1.0 + item.statistic / (2 * marks)))) if np.isfinite(statistic) else np.nan
-        rivals: tuple[tuple[str, str], ...] = ()
-        if item.kind == "camera_moved" and len(orientation.names) == 2 and not item.alone:
+        rivals: tuple[tuple[Kind, str], ...] = ()
+        if item.kind.moves == "camera" and len(orientation.names) == 2 and not item.alone:
             other = next(name for name in orientation.names if name != item.where)
-            rivals = (("camera_moved", other),)
-        where = item.where.split(",")[0]
+            rivals = ((item.kind, other),)
         yield ImageFinding(
-            item.kind, stage, where, None, told, sigma, p_value, rivals, (alone * before, alone * rms), text
+            item.kind, item.where, None, reported, sigma, p_value, rivals, (alone * before, alone * rms), text
         )
 
 
 def beyond_lenses(findings: Sequence[ImageFinding], cameras: Mapping[str, Camera]) -> tuple[ImageFinding, ...]:
-    """Findings in which lens terms of a size that no lens has are told as what they stand for: refraction.
+    """Findings in which lens terms of a size that no lens has are reported as what they stand for: refraction.
 
-    A camera looks through glass or water; in few images decentring and affinity take over most of what that does.
-    Where refraction is found on the same camera too, the terms are told beside it, as what it is hard to tell from.
+    A camera analyses through glass or water; in few images decentring and affinity take over most of what that does.
+    Where refraction is found on the same camera too, the terms are reported beside it, as what it is hard to tell from.
 
     Parameters
     ----------
@@ -148,8 +143,8 @@ def beyond_lenses(findings: Sequence[ImageFinding], cameras: Mapping[str, Camera
     out = [f for f in findings if f not in strange]
     for where in dict.fromkeys(f.where for f in strange):
         terms = [f for f in strange if f.where == where]
-        rivals = tuple((f.cause, where) for f in terms)
-        at = next((i for i, f in enumerate(out) if (f.cause, f.where) == ("refraction", where)), None)
+        rivals = tuple((f.kind, where) for f in terms)
+        at = next((i for i, f in enumerate(out) if (f.kind, f.where) == (REFRACTION, where)), None)
         if at is not None:
             least = min(f.p_value for f in (out[at], *terms))
             out[at] = replace(out[at], rivals=(*out[at].rivals, *rivals), p_value=least)
@@ -157,24 +152,26 @@ def beyond_lenses(findings: Sequence[ImageFinding], cameras: Mapping[str, Camera
         formula = "; ".join(f"{name} = {value:.4g}" for f in terms for name, value in f.parameters.items())
         term = {"variables": ["x_px", "y_px"], "kind": "formula", "formula": f"lens terms {formula}"}
         best = min(terms, key=lambda f: f.p_value)
-        text = f"Camera {where} looks through glass or water: its images are bent more than any lens does ({formula})"
+        text = (
+            f"Camera {where} analyses through glass or water: its images are bent more than any lens does ({formula})"
+        )
         parameters: dict[str, object] = {"term": term}
-        out.append(replace(best, cause="refraction", parameters=parameters, sigma={}, rivals=rivals, statement=text))
-    return tuple(sorted(out, key=lambda f: f.cause != "refraction")) if strange else tuple(findings)
+        out.append(replace(best, kind=REFRACTION, parameters=parameters, sigma={}, rivals=rivals, statement=text))
+    return tuple(sorted(out, key=lambda f: f.kind != REFRACTION)) if strange else tuple(findings)
 
 
 def _strange(finding: ImageFinding, camera: Camera) -> bool:
-    if finding.cause == "lens_tangential":
+    if finding.kind == LENS_TANGENTIAL:
         return max(abs(camera.p1), abs(camera.p2)) > TANGENTIAL
-    return finding.cause == "lens_affinity" and abs(camera.fy - camera.fx) > AFFINITY * camera.fx
+    return finding.kind == LENS_AFFINITY and abs(camera.fy - camera.fx) > AFFINITY * camera.fx
 
 
-def _with_swaps(evidence: Sequence[Evidence], given: Body | None) -> list[Evidence]:
+def _with_swaps(evidence: Sequence[StationCause], given: Body | None) -> list[StationCause]:
     """Two targets of which each sits where the file has the other are swapped, not shifted."""
     left = list(evidence)
     if given is None:
         return left
-    shifted = [item for item in evidence if item.kind == "target_shifted"]
+    shifted = [item for item in evidence if item.kind.moves == "target"]
     for k, a in enumerate(shifted):
         for b in shifted[k + 1 :]:
             i, j = (int(given.index([int(item.where)])[0]) for item in (a, b))
@@ -184,26 +181,40 @@ def _with_swaps(evidence: Sequence[Evidence], given: Body | None) -> list[Eviden
             if exchange and a in left and b in left:
                 left.remove(a)
                 left.remove(b)
-                pair = f"{a.where},{b.where}"
                 statistic = a.statistic + b.statistic
-                left.append(Evidence("target_swapped", pair, None, way, a.covariance, statistic, 6, a.statement))
+                left.append(
+                    StationCause(
+                        TARGET_SWAPPED,
+                        a.where,
+                        None,
+                        None,
+                        way,
+                        a.covariance,
+                        statistic,
+                        6,
+                        a.statement,
+                        partner=b.where,
+                    )
+                )
     return left
 
 
-def _told(
-    orientation: StationOrientation, item: Evidence, pose_names: tuple[str, ...]
-) -> tuple[dict[str, object] | None, dict[str, object], str, str]:
+def _reported(
+    orientation: StationOrientation, item: StationCause, pose_names: tuple[str, ...]
+) -> tuple[dict[str, object] | None, dict[str, object], str]:
+    """Parameters, sigmas and sentence of what the adjustment freed; None for what is no cause."""
     spread = np.sqrt(np.clip(np.diag(item.covariance), 0.0, None))
-    if item.kind in LENS_GROUPS:
+    reported: dict[str, object]
+    if item.kind.intrinsics:
         camera = orientation.cameras[orientation.names.index(item.where)]
-        free = [n for n in LENS_GROUPS[item.kind] if n in {"p1", "p2", *orientation.free_interior[item.where]}]
-        if item.kind == "lens_affinity":
-            told: dict[str, object] = {"fy_minus_fx_px": camera.fy - camera.fx}
+        free = [n for n in item.kind.intrinsics if n in {"p1", "p2", *orientation.free_interior[item.where]}]
+        if item.kind == LENS_AFFINITY:
+            reported = {"fy_minus_fx_px": camera.fy - camera.fx}
         else:
-            told = {name: float(getattr(camera, name)) for name in free}
-        text = f"The lens of camera '{item.where}' has {KIND[item.kind]} that its file leaves out"
-        return told, dict(zip(told, map(float, spread), strict=False)), "camera", text
-    if item.kind == "camera_moved" and item.pose is not None:
+            reported = {name: float(getattr(camera, name)) for name in free}
+        sigma: dict[str, object] = dict(zip(reported, map(float, spread), strict=False))
+        return reported, sigma, item.kind.describe(item.where, reported)
+    if item.kind.moves == "camera" and item.pose is not None:
         label = pose_names[item.pose]
         scale = np.r_[np.full(3, 1e3), np.full(3, np.degrees(1.0))]
         moved, covariance = item.estimate, item.covariance
@@ -211,18 +222,14 @@ def _told(
         if item.pose in orientation.exterior_first_pose[of_camera]:  # as adjusted, not as tested for
             moved, covariance = orientation.movement(item.where, item.pose)
         values, sigmas = moved * scale, np.sqrt(np.clip(np.diag(covariance), 0.0, None)) * scale
-        told = {"pose": label, "shift_mm": values[:3].tolist(), "turn_deg": values[3:].tolist()}
-        text = (
-            f"Camera {item.where} moved before pose {label} by {np.linalg.norm(values[:3]):.3f} mm and "
-            f"{np.linalg.norm(values[3:]):.4f} deg"
-        )
-        return told, {"shift_mm": sigmas[:3].tolist(), "turn_deg": sigmas[3:].tolist()}, "camera", text
-    if item.kind == "target_swapped":
-        first, second = item.where.split(",")
-        text = f"Targets {first} and {second} are swapped: each sits where the file has the other"
-        return {"with": int(second)}, {}, "body", text
-    if item.kind == "target_shifted":
-        values = item.estimate * 1e3
-        text = f"Target {item.where} sits {np.linalg.norm(values):.3f} mm from where its file says"
-        return {"shift_mm": values.tolist()}, {"shift_mm": (spread * 1e3).tolist()}, "body", text
-    return None, {}, "camera", ""
+        reported = {"pose": label, "shift_mm": values[:3].tolist(), "turn_deg": values[3:].tolist()}
+        size = f" by {np.linalg.norm(values[:3]):.3f} mm and {np.linalg.norm(values[3:]):.4f} deg"
+        text = item.kind.describe(item.where, reported) + size
+        return reported, {"shift_mm": sigmas[:3].tolist(), "turn_deg": sigmas[3:].tolist()}, text
+    if item.kind.is_relabelling:
+        reported = {"with": int(item.partner)}
+        return reported, {}, item.kind.describe(item.where, reported)
+    if item.kind.moves == "target":
+        reported = {"shift_mm": (item.estimate * 1e3).tolist()}
+        return reported, {"shift_mm": (spread * 1e3).tolist()}, item.kind.describe(item.where, reported)
+    return None, {}, ""

@@ -12,12 +12,13 @@ from dataclasses import replace
 import numpy as np
 from scipy import stats
 
-from robcal.diagnosis.images.data import ImageData
 from robcal.diagnosis.images.diagnosis import ImageFinding, diagnose_images
 from robcal.photogrammetry.station.network import StationMarks
 from robcal.photogrammetry.station.seen_normals import Ellipses
+from robcal.physics.images.cause import CENTROID_BIAS
+from robcal.physics.images.data import ImageData
 
-CAUSE, BY_LIGHT = "centroid_bias", "by_light_px"
+BY_LIGHT = "by_light_px"
 SUSPECT = 1e-4
 """Significance of light alone from which it is looked at beside all other causes."""
 
@@ -37,7 +38,7 @@ def without_lag(
     data = view()
     if not _suspect(data):
         return as_they_are, ()
-    found = [f for f in diagnose_images(data).findings if f.cause == CAUSE and BY_LIGHT in f.parameters]
+    found = [f for f in diagnose_images(data).findings if f.kind == CENTROID_BIAS and BY_LIGHT in f.parameters]
     corrected = as_they_are
     for finding in found:
         name = finding.where

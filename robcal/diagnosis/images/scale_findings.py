@@ -13,6 +13,7 @@ from scipy import stats
 from robcal.diagnosis.images.diagnosis import ImageFinding
 from robcal.photogrammetry.bundle.lengths import distances
 from robcal.photogrammetry.core.network import CameraNetwork
+from robcal.physics.measuring import SCALE_ERROR
 from robcal.transforms import Array
 
 LEVEL = 1e-4
@@ -50,10 +51,8 @@ def scale_findings(network: CameraNetwork, body: str) -> tuple[ImageFinding, ...
         "a scale bar is not as long as stated, or the check lengths are not"
     )
     nothing = (float("nan"), float("nan"))
-    told: dict[str, object] = {"ppm": ppm}
-    found = ImageFinding(
-        "scale_error", "camera", "station", None, told, {"ppm": 1e6 * sigma}, p_value, (), nothing, text
-    )
+    reported: dict[str, object] = {"ppm": ppm}
+    found = ImageFinding(SCALE_ERROR, "station", None, reported, {"ppm": 1e6 * sigma}, p_value, (), nothing, text)
     return (found,)
 
 

@@ -11,18 +11,19 @@ from collections.abc import Mapping
 import numpy as np
 from scipy import linalg, sparse, stats
 
-from robcal.diagnosis.images.data import LENS_TERMS, ImageData
 from robcal.diagnosis.images.diagnosis import spread_of_others
 from robcal.diagnosis.scan.statistics import orthonormal_basis
+from robcal.estimation.grouping import sum_by
 from robcal.photogrammetry.core.bodies import Body
 from robcal.photogrammetry.core.camera import Camera
-from robcal.photogrammetry.core.grouping import sum_by
 from robcal.photogrammetry.station.adjustment import global_columns, interior_basis, interior_prior
+from robcal.photogrammetry.station.contradictions import CAMERA_MOVED
 from robcal.photogrammetry.station.network import StationDesign, StationOrientation, StationSettings, Unknowns
 from robcal.photogrammetry.station.scan import scan_moves
 from robcal.photogrammetry.station.start import exchanged
 from robcal.photogrammetry.station.state import body_weight
 from robcal.physics.cause import Array
+from robcal.physics.images.data import LENS_TERMS, ImageData
 from robcal.transforms import invert, transform
 
 FROM_FILE = 0.1
@@ -152,15 +153,15 @@ def station_data(
             name: np.nan_to_num(np.asarray(values)[orientation.poses] - values[orientation.poses[0]])[marks.pose]
             for name, values in (covariates or {}).items()
         },
-        inflation={"camera_moved": max(1.0, scatter)},
+        inflation={CAMERA_MOVED.name: max(1.0, scatter)},
     )
 
 
 def given_points(orientation: StationOrientation, given: Body) -> Body:
     """The body as the adjustment took it: with targets exchanged where it found them swapped."""
     for item in orientation.evidence:
-        if item.kind == "target_swapped":
-            i, j = (int(given.index([int(part)])[0]) for part in item.where.split(","))
+        if item.kind.is_relabelling:
+            i, j = (int(given.index([int(part)])[0]) for part in (item.where, item.partner))
             given = exchanged(given, i, j)
     return given
 
@@ -174,7 +175,7 @@ def _body_rows(orientation: StationOrientation, given: Body | None, factor: floa
     t = len(stated)
     x = Unknowns(np.zeros((0, 9)), orientation.world_T_exterior, orientation.world_T_body, orientation.body.points)
     weight = body_weight(stated, orientation.marks, x, orientation.cameras, StationSettings()) / factor
-    released = [item.where for item in orientation.evidence if item.kind == "target_shifted"]
+    released = [item.where for item in orientation.evidence if item.kind.moves == "target"]
     if released:
         C = np.asarray(np.linalg.inv(weight))
         for name in released:

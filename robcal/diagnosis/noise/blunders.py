@@ -1,4 +1,4 @@
-"""Isolated gross errors: one pose or one point whose residuals do not fit, told apart from physics by evidence."""
+"""Isolated gross errors: one pose or one point whose residuals do not fit, reported apart from physics by evidence."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ from robcal.physics.cause import Array
 LEAST_DEVIATION = 1e-3
 """Metres: mean length deviations below this are no matter of numbers."""
 LEFT_OVER = 0.02
-"""Share of the square sum of length deviations that may remain once the numbers are exchanged."""
+"""Share of the sum of squares of length deviations that may remain once the numbers are exchanged."""
 
 
 def find_swaps(recording: Recording, most: int = 3) -> tuple[tuple[int, int], ...]:

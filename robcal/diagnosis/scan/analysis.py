@@ -1,4 +1,4 @@
-"""One look at one fit: all candidates tested, ranked, and the family-wise probability of the largest."""
+"""One analysis at one fit: all candidates tested, ranked, and the family-wise probability of the largest."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from robcal.diagnosis.scan.family_wise import FamilyWise, simulate, tails
 from robcal.diagnosis.scan.posterior import Posterior, posterior
 from robcal.diagnosis.scan.statistics import ScanResult, Stack, orthonormal_basis, restack, scan, stack_entries
 from robcal.diagnosis.scan.tangents import Tangents, entries, tangents
-from robcal.physics.cause import Array, Constants, Family, ObservationData
-from robcal.physics.empirical import empirical_families
-from robcal.physics.library import all_families
+from robcal.physics.cause import Array, Constants, LinearCause, ObservationData
+from robcal.physics.empirical import empirical_causes
+from robcal.physics.library import all_causes
 from robcal.physics.site import RobotSite
 
 OWN_LEVEL = 0.05
-"""Family-wise level that a family has to reach by itself before it may be named."""
+"""Family-wise level that a cause has to reach by itself before it may be named."""
 
 
 @dataclass(frozen=True)
@@ -29,14 +29,14 @@ class Analysis:
 
     Attributes
     ----------
-    families : named ones and empirical ones; `named` (f,) tells which.
+    causes : named ones and empirical ones; `named` (f,) tells which.
     basis : (m, p) orthonormal basis of the fitted Jacobian. residual : (m,) projected.
     stacks, result, ranked : the scan. family_wise : its level. p_value : of the largest mismatch.
     """
 
     fit: Fit
     at: Tangents
-    families: tuple[Family, ...]
+    causes: tuple[LinearCause, ...]
     named: Array
     basis: Array
     residual: Array
@@ -47,38 +47,31 @@ class Analysis:
     p_value: float
     suspect: Suspect
 
-    def top(self, chosen: Array) -> int:
-        """Most probable family among the chosen ones."""
+    def most_probable(self, chosen: Array) -> int:
+        """Most probable cause among the chosen ones."""
         return int(np.argmax(np.where(chosen, self.ranked.log_weight, -np.inf)))
 
     def significant(self) -> Array:
-        """Families (f,) whose best entry is significant family-wise, or, if none is, the one with the best entry."""
-        log_p = np.zeros(len(self.families))
-        np.minimum.at(log_p, self.result.family, self.result.log_p)
+        """Causes (f,) whose best entry is significant family-wise, or, if none is, the one with the best entry."""
+        log_p = np.zeros(len(self.causes))
+        np.minimum.at(log_p, self.result.cause, self.result.log_p)
         found = np.array([self.family_wise.probability(float(value)) <= OWN_LEVEL for value in log_p])
         return found if np.any(found) else log_p == log_p.min()
 
-    def constants(self, family: int) -> Constants:
-        """Best grid point of a family."""
-        return self.families[family].grid[int(self.ranked.best_grid[family])]
+    def constants(self, cause: int) -> Constants:
+        """Best grid point of a cause."""
+        return self.causes[cause].grid[int(self.ranked.best_grid[cause])]
 
 
-def library_at(fit: Fit, recording: Recording, at: Tangents, tied: frozenset[str]) -> tuple[Family, ...]:
-    """Families that may act here and are not in the model already."""
+def library_at(fit: Fit, recording: Recording, at: Tangents, tied: frozenset[str]) -> tuple[LinearCause, ...]:
+    """Causes that may act here and are not in the model already."""
     site = RobotSite(fit.model, at.variables, frozenset(fit.free), tied)
-    present = {(a.family.key, tuple(sorted(a.constants.items()))) for a in fit.accepted}
-    single = {a.family.key for a in fit.accepted if acts_once(a.family)}
-    judged = {"camera_moved"} if recording.own_station else set()
-    known = all_families(site, at.data, recording.ids, recording.body)
-    named = [f for f in known if f.key not in single and f.cause not in judged]
-    empirical = list(empirical_families(site)) if recording.observations_are_spatial else []
+    present = {(a.cause.key, tuple(sorted(a.constants.items()))) for a in fit.accepted}
+    single = {a.cause.key for a in fit.accepted if a.cause.acts_once}
+    known = all_causes(site, at.data, recording.ids, recording.body)
+    named = [f for f in known if f.key not in single and not (recording.own_station and f.kind.moves == "camera")]
+    empirical = list(empirical_causes(site)) if recording.observations_are_spatial else []
     return tuple(f for f in (*named, *empirical) if (f.key, tuple(sorted(f.grid[0].items()))) not in present)
-
-
-def acts_once(family: Family) -> bool:
-    """Whether a place has a cause of this kind at most once: its constants bend one law (a threshold, a torque scale,
-    a time constant), while jumps at several poses and waves of several orders may add up."""
-    return len(family.grid) == 1 or bool(family.continuous) or "threshold_Nm" in family.ordered
 
 
 def analyse(
@@ -86,23 +79,23 @@ def analyse(
 ) -> Analysis:
     """Scan all candidates at a fit; `level` reuses a simulated family-wise level of the same design."""
     at = tangents(fit, recording)
-    families = library_at(fit, recording, at, tied)
+    causes = library_at(fit, recording, at, tied)
     basis = orthonormal_basis(fit.jacobian)
-    return _look(fit, at, families, stack_entries(entries(families, at), basis), basis, runs, level)
+    return _ranked(fit, at, causes, stack_entries(entries(causes, at), basis), basis, runs, level)
 
 
 def extend(analysis: Analysis, columns: Array) -> Analysis:
-    """The same look with further columns (m, c) fitted, to first order: what would be left after adding a cause."""
+    """The same analysis with further columns (m, c) fitted, to first order: what would be left after adding a cause."""
     further = orthonormal_basis(columns - analysis.basis @ (analysis.basis.T @ columns))
     basis = np.concatenate([analysis.basis, further], axis=1)
     stacks = restack(analysis.stacks, further)
-    return _look(analysis.fit, analysis.at, analysis.families, stacks, basis, 0, analysis.family_wise)
+    return _ranked(analysis.fit, analysis.at, analysis.causes, stacks, basis, 0, analysis.family_wise)
 
 
-def _look(
+def _ranked(
     fit: Fit,
     at: Tangents,
-    families: Sequence[Family],
+    causes: Sequence[LinearCause],
     stacks: tuple[Stack, ...],
     basis: Array,
     runs: int,
@@ -111,18 +104,18 @@ def _look(
     residual = fit.residual - basis @ (basis.T @ fit.residual)
     redundancy = len(residual) - basis.shape[1]
     result = scan(stacks, residual, redundancy)
-    ranked = posterior(families, result)
+    ranked = posterior(causes, result)
     groups = at.recording.row_groups(len(residual))
     family_wise = level
     if family_wise is None:
         freedom = tails(residual, redundancy)
         family_wise = simulate(stacks, basis, redundancy, len(residual), runs=runs, freedom=freedom, block=groups)
     p_value = family_wise.probability(float(result.log_p[result.best]))
-    named = np.array([family.cause != "unknown" for family in families])
+    named = np.array([cause.kind.named for cause in causes])
     return Analysis(
         fit,
         at,
-        tuple(families),
+        tuple(causes),
         named,
         basis,
         residual,
@@ -158,13 +151,13 @@ def rigid_motions(data: ObservationData) -> Array | None:
     return np.concatenate([np.broadcast_to(np.eye(3), turns.shape), turns], axis=2)
 
 
-def accepted_from(analysis: Analysis, family: int, constants: Constants) -> Accepted:
-    """A family to be added, with start values from the linear problem."""
-    chosen = analysis.families[family]
+def accepted_from(analysis: Analysis, cause: int, constants: Constants) -> Accepted:
+    """A cause to be added, with start values from the linear problem."""
+    chosen = analysis.causes[cause]
     sizes = chosen.sizes(constants)
     columns = analysis.at.columns(chosen, constants) * sizes
     projected = columns - analysis.basis @ (analysis.basis.T @ columns)
     gram = projected.T @ projected + np.eye(len(sizes)) * 1e-2
     values = np.linalg.solve(gram, projected.T @ analysis.residual) * sizes
-    start = 0.0 * values if chosen.frees else values
+    start = 0.0 * values if chosen.free_parameters else values
     return Accepted(chosen, constants, start, np.zeros((len(values), len(values))))

@@ -1,4 +1,4 @@
-"""Family-wise level of the scan: how small the smallest probability gets when nothing is missing.
+"""LinearCause-wise level of the scan: how small the smallest probability gets when nothing is missing.
 
 The candidates are strongly correlated, so Bonferroni's number of tests is far too large. Residuals are simulated on
 the same design, scanned, and the effective number of independent tests is read from the distribution of the smallest
@@ -28,7 +28,7 @@ class FamilyWise:
     smallest: Array
 
     def probability(self, log_p: float) -> float:
-        """Family-wise probability of a smallest single-test probability."""
+        """LinearCause-wise probability of a smallest single-test probability."""
         single = np.exp(log_p)
         if self.tests * single < 1e-4:
             return float(min(1.0, self.tests * single))

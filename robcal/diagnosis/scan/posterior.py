@@ -1,4 +1,4 @@
-"""From a scan to names: posterior over families, refinement of constants, rivals."""
+"""From a scan to names: posterior over causes, refinement of constants, rivals."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from scipy import optimize, special
 from robcal.diagnosis.core.result import Rival
 from robcal.diagnosis.scan.statistics import Entry, ScanResult, Stack, log_bayes_factor, stack_entries
 from robcal.diagnosis.scan.tangents import Tangents
-from robcal.physics.cause import Array, Constants, Family
+from robcal.physics.cause import Array, Constants, LinearCause
 
 SAME_SIGNATURE = 0.98
 """Share of the named signature that a rival must reproduce to be called indistinguishable."""
@@ -21,7 +21,7 @@ SET_LEVEL = 0.99
 
 @dataclass(frozen=True)
 class Posterior:
-    """Families ranked by evidence.
+    """Causes ranked by evidence.
 
     Attributes
     ----------
@@ -33,55 +33,55 @@ class Posterior:
     best_grid: Array
 
     def order(self) -> Array:
-        """Families from the most to the least probable."""
+        """Causes from the most to the least probable."""
         return np.argsort(-self.log_weight, kind="stable")
 
     def probability(self, chosen: Array) -> Array:
-        """Posterior of the families where `chosen` (f,) is true, relative to these."""
+        """Posterior of the causes where `chosen` (f,) is true, relative to these."""
         weight = np.where(chosen, self.log_weight, -np.inf)
         top = weight.max(initial=-np.inf)
         return np.exp(weight - special.logsumexp(weight)) if np.isfinite(top) else np.zeros(len(weight))
 
 
-def posterior(families: Sequence[Family], result: ScanResult) -> Posterior:
-    """Evidence of each family, averaged over its grid."""
-    count = len(families)
+def posterior(causes: Sequence[LinearCause], result: ScanResult) -> Posterior:
+    """Evidence of each cause, averaged over its grid."""
+    count = len(causes)
     top = np.full(count, -np.inf)
-    np.maximum.at(top, result.family, result.log_evidence)
+    np.maximum.at(top, result.cause, result.log_evidence)
     seen = np.isfinite(top)
-    above = result.log_evidence - np.where(seen, top, 0.0)[result.family]
-    total = np.bincount(result.family, weights=np.exp(above), minlength=count)
-    places = np.array([len(family.grid) / family.weight for family in families])
+    above = result.log_evidence - np.where(seen, top, 0.0)[result.cause]
+    total = np.bincount(result.cause, weights=np.exp(above), minlength=count)
+    places = np.array([len(cause.grid) / cause.weight for cause in causes])
     log_weight = np.where(seen, top + np.log(np.where(seen, total, 1.0)) - np.log(places), -np.inf)
     best = np.zeros(count, dtype=int)
     first = np.flatnonzero(above == 0.0)[::-1]  # the first of equals is written last
-    best[result.family[first]] = result.grid[first]
+    best[result.cause[first]] = result.grid[first]
     return Posterior(log_weight, np.where(seen, best, 0))
 
 
-def refine(family: Family, constants: Constants, at: Tangents, fitted: Array, residual: Array) -> Constants:
+def refine(cause: LinearCause, constants: Constants, at: Tangents, fitted: Array, residual: Array) -> Constants:
     """Constants moved from their grid point to the best fit of the linearised problem: between the grid's values for
     continuous ones, among the neighbours for those of which the grid holds a part only."""
-    for name, values in family.ordered.items():
-        constants = _nearby(family, constants, name, values, at, fitted, residual)
-    if not family.continuous:
+    for name, values in cause.ordered.items():
+        constants = _nearby(cause, constants, name, values, at, fitted, residual)
+    if not cause.continuous:
         return constants
-    names = [name for name in family.continuous if np.isfinite(constants[name])]
+    names = [name for name in cause.continuous if np.isfinite(constants[name])]
 
     def badness(logs: Array) -> float:
         trial = dict(constants)
         for name, value in zip(names, logs, strict=True):
-            low, high = family.continuous[name]
+            low, high = cause.continuous[name]
             trial[name] = float(np.clip(value if low <= 0 else np.exp(value), low, high))
-        columns = at.columns(family, trial) * family.sizes(trial)
+        columns = at.columns(cause, trial) * cause.sizes(trial)
         (stack,) = stack_entries([Entry(0, 0, columns)], fitted)
         z = np.einsum("mc,m->c", stack.basis[0], residual)
         return -float(log_bayes_factor(stack.singular, z[None, :])[0])
 
-    start = np.array([constants[n] if family.continuous[n][0] <= 0 else np.log(constants[n]) for n in names])
+    start = np.array([constants[n] if cause.continuous[n][0] <= 0 else np.log(constants[n]) for n in names])
     spread = np.array(
         [
-            0.02 * (family.continuous[n][1] - family.continuous[n][0]) if family.continuous[n][0] <= 0 else 0.3
+            0.02 * (cause.continuous[n][1] - cause.continuous[n][0]) if cause.continuous[n][0] <= 0 else 0.3
             for n in names
         ]
     )
@@ -92,13 +92,13 @@ def refine(family: Family, constants: Constants, at: Tangents, fitted: Array, re
         return constants
     refined = dict(constants)
     for name, value in zip(names, found.x, strict=True):
-        low, high = family.continuous[name]
+        low, high = cause.continuous[name]
         refined[name] = float(np.clip(value if low <= 0 else np.exp(value), low, high))
     return refined
 
 
 def _nearby(
-    family: Family,
+    cause: LinearCause,
     constants: Constants,
     name: str,
     values: Sequence[float],
@@ -106,13 +106,13 @@ def _nearby(
     fitted: Array,
     residual: Array,
 ) -> Constants:
-    tried = sorted(point[name] for point in family.grid)
+    tried = sorted(point[name] for point in cause.grid)
     here = tried.index(constants[name])
     low, high = tried[max(here - 1, 0)], tried[min(here + 1, len(tried) - 1)]
     trials = [dict(constants) | {name: v} for v in values if low < v < high]
     if len(tried) == len(values) or len(trials) < 2:
         return constants
-    listed = [Entry(0, g, at.columns(family, trial) * family.sizes(trial)) for g, trial in enumerate(trials)]
+    listed = [Entry(0, g, at.columns(cause, trial) * cause.sizes(trial)) for g, trial in enumerate(trials)]
     best, chosen = -np.inf, constants
     for stack in stack_entries(listed, fitted):
         evidence = log_bayes_factor(stack.singular, residual @ stack.basis)
@@ -127,32 +127,32 @@ def signature(columns: Array, values: Array, fitted: Array) -> Array:
     return effect - fitted @ (fitted.T @ effect)
 
 
-def overlap(stacks: Sequence[Stack], projected: Array, families: int) -> tuple[Array, Array]:
-    """Largest share of a projected signature that each family can reproduce, and at which grid point."""
-    share = np.zeros(families)
-    grid = np.zeros(families, dtype=int)
+def overlap(stacks: Sequence[Stack], projected: Array, causes: int) -> tuple[Array, Array]:
+    """Largest share of a projected signature that each cause can reproduce, and at which grid point."""
+    share = np.zeros(causes)
+    grid = np.zeros(causes, dtype=int)
     size = float(projected @ projected)
     if size == 0:
         return share, grid
     for stack in stacks:
         part = np.sum((projected @ stack.basis) ** 2, axis=1) / size
         for e in range(len(part)):
-            if part[e] > share[stack.family[e]]:
-                share[stack.family[e]], grid[stack.family[e]] = part[e], stack.grid[e]
+            if part[e] > share[stack.cause[e]]:
+                share[stack.cause[e]], grid[stack.cause[e]] = part[e], stack.grid[e]
     return share, grid
 
 
 def rivals(
-    families: Sequence[Family],
+    causes: Sequence[LinearCause],
     named: int,
     ranked: Posterior,
     stacks: Sequence[Stack],
     projected: Array,
     eligible: Array,
 ) -> tuple[Rival, ...]:
-    """The rest of the 99 % set, and every eligible family with (nearly) the same signature and a fair evidence."""
+    """The rest of the 99 % set, and every eligible cause with (nearly) the same signature and a fair evidence."""
     probability = ranked.probability(eligible)
-    share, share_grid = overlap(stacks, projected, len(families))
+    share, share_grid = overlap(stacks, projected, len(causes))
     chosen: dict[int, int] = {}
     total = 0.0
     for f in np.argsort(-probability):
@@ -164,5 +164,5 @@ def rivals(
         if ranked.log_weight[f] > ranked.log_weight[named] - 7.0:
             chosen.setdefault(int(f), int(share_grid[f]))
     chosen.pop(named, None)
-    found = [Rival(families[f], families[f].grid[g], float(probability[f]), float(share[f])) for f, g in chosen.items()]
+    found = [Rival(causes[f], causes[f].grid[g], float(probability[f]), float(share[f])) for f, g in chosen.items()]
     return tuple(sorted(found, key=lambda rival: -rival.probability))

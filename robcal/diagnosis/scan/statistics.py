@@ -25,10 +25,10 @@ LEAST_SIGNAL = 0.05
 
 @dataclass(frozen=True)
 class Entry:
-    """One candidate with fixed constants: index of its family, of its grid point, its whitened columns (m, c), and, for
+    """One candidate with fixed constants: index of its cause, of its grid point, its whitened columns (m, c), and, for
     a single column, the prior probability that its amplitude is positive."""
 
-    family: int
+    cause: int
     grid: int
     columns: Array
     positive: float = 0.5
@@ -40,7 +40,7 @@ class Stack:
 
     Attributes
     ----------
-    family, grid : (e,) indices.
+    cause, grid : (e,) indices.
     basis : (e, m, c) orthonormal columns U (zero where a direction cannot be seen).
     singular : (e, c) projected signal per prior amplitude, in sigma.
     right : (e, c, c) V'.
@@ -48,7 +48,7 @@ class Stack:
     positive : (e,) prior probability of a positive amplitude.
     """
 
-    family: Array
+    cause: Array
     grid: Array
     basis: Array
     singular: Array
@@ -63,7 +63,7 @@ class ScanResult:
 
     Attributes
     ----------
-    family, grid : (e,) indices. count : (e,) degrees of freedom.
+    cause, grid : (e,) indices. count : (e,) degrees of freedom.
     chi2 : (e,) squared norm of the projected residual, divided by the variance factor.
     log_p : (e,) natural logarithm of the single-test F probability.
     log_evidence : (e,) logarithm of the Bayes factor against no cause.
@@ -71,7 +71,7 @@ class ScanResult:
     redundancy : degrees of freedom of the residuals.
     """
 
-    family: Array
+    cause: Array
     grid: Array
     count: Array
     chi2: Array
@@ -111,8 +111,8 @@ def stack_entries(entries: Sequence[Entry], fitted: Fitted) -> tuple[Stack, ...]
     for width in sorted({entry.columns.shape[1] for entry in entries}):
         group = [entry for entry in entries if entry.columns.shape[1] == width]
         projected = _projected(np.stack([entry.columns for entry in group]), fitted)
-        family, grid = (np.array([getattr(entry, name) for entry in group]) for name in ("family", "grid"))
-        stacks.append(_orthonormalised(projected, family, grid, np.array([entry.positive for entry in group])))
+        cause, grid = (np.array([getattr(entry, name) for entry in group]) for name in ("cause", "grid"))
+        stacks.append(_orthonormalised(projected, cause, grid, np.array([entry.positive for entry in group])))
     return tuple(stacks)
 
 
@@ -121,7 +121,7 @@ def restack(stacks: Sequence[Stack], further: Array) -> tuple[Stack, ...]:
     again = []
     for stack in stacks:
         projected = _projected(stack.basis * stack.singular[:, None, :], further)
-        new = _orthonormalised(projected, stack.family, stack.grid, stack.positive)
+        new = _orthonormalised(projected, stack.cause, stack.grid, stack.positive)
         again.append(replace(new, right=new.right @ stack.right))
     return tuple(again)
 
@@ -137,7 +137,7 @@ def _projected(columns: Array, fitted: Fitted) -> Array:
     return np.ascontiguousarray(flat.reshape(m, e, c).transpose(1, 0, 2))
 
 
-def _orthonormalised(projected: Array, family: Array, grid: Array, positive: Array) -> Stack:
+def _orthonormalised(projected: Array, cause: Array, grid: Array, positive: Array) -> Stack:
     if projected.shape[2] == 1:
         singular = np.linalg.norm(projected, axis=1)
         right = np.ones((len(projected), 1, 1))
@@ -150,7 +150,7 @@ def _orthonormalised(projected: Array, family: Array, grid: Array, positive: Arr
         basis = projected @ (vectors / np.where(singular > 0, singular, 1.0)[:, None, :])
     seen = (singular > LEAST_SIGNAL) & (singular > 1e-5 * singular.max(axis=1, keepdims=True, initial=0.0))
     basis *= seen[:, None, :]
-    return Stack(family, grid, basis, singular * seen, right, seen.sum(axis=1), positive)
+    return Stack(cause, grid, basis, singular * seen, right, seen.sum(axis=1), positive)
 
 
 def log_bayes_factor(singular: Array, z: Array, positive: Array | None = None) -> Array:
@@ -177,7 +177,7 @@ def scan(stacks: Sequence[Stack], residual: Array, redundancy: int) -> ScanResul
     """
     scores = [residual @ stack.basis for stack in stacks]
     raw = np.concatenate([np.sum(z**2, axis=1) for z in scores])
-    family = np.concatenate([stack.family for stack in stacks])
+    cause = np.concatenate([stack.cause for stack in stacks])
     grid = np.concatenate([stack.grid for stack in stacks])
     count = np.concatenate([stack.count for stack in stacks])
     total = float(residual @ residual)
@@ -192,11 +192,11 @@ def scan(stacks: Sequence[Stack], residual: Array, redundancy: int) -> ScanResul
         ]
     )
     evidence[count == 0] = -np.inf
-    return ScanResult(family, grid, count, raw / variance, log_p, evidence, float(variance), redundancy)
+    return ScanResult(cause, grid, count, raw / variance, log_p, evidence, float(variance), redundancy)
 
 
 def log_f_probability(raw: Array, count: Array, total: Array | float, redundancy: int) -> Array:
-    """Natural logarithm of the F test's probability that `count` columns explain `raw` of the `total` square sum."""
+    """Logarithm of the F test's probability that `count` columns explain `raw` of the `total` sum of squares."""
     left = np.maximum(redundancy - count, 1)
     used = np.maximum(count, 1)
     ratio = (raw / used) / (np.maximum(np.asarray(total) - raw, 1e-300) / left)

@@ -1,4 +1,4 @@
-"""Whitened tangent columns of families at a fit: what each cause would do to the residuals."""
+"""Whitened tangent columns of causes at a fit: what each cause would do to the residuals."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ import numpy as np
 from robcal.diagnosis.core.fitting import Fit
 from robcal.diagnosis.core.recording import Recording, observation_data
 from robcal.diagnosis.scan.statistics import Entry
-from robcal.physics.cause import Array, Basis, Constants, Family, ObservationData
+from robcal.physics.cause import Array, Basis, Constants, LinearCause, ObservationCause, ObservationData
 from robcal.robot.terms import names_in
 
 
 @dataclass(frozen=True)
 class Tangents:
-    """Everything needed to write a family's columns at one fit.
+    """Everything needed to write a cause's columns at one fit.
 
     Attributes
     ----------
@@ -35,18 +35,17 @@ class Tangents:
     frames: Array
     data: ObservationData
 
-    def columns(self, family: Family, constants: Constants) -> Array:
-        """Whitened columns (m, c) of a family per unit amplitude."""
-        if family.frees:
-            return np.stack([self.parameters[name] for name in family.frees], axis=1)
-        if family.displace is not None:
-            return self.recording.whiten(family.displace(self.data, constants), self.frames)
-        names = family.names(constants)
+    def columns(self, cause: LinearCause, constants: Constants) -> Array:
+        """Whitened columns (m, c) of a cause per unit amplitude."""
+        if cause.free_parameters:
+            return np.stack([self.parameters[name] for name in cause.free_parameters], axis=1)
+        if isinstance(cause, ObservationCause):
+            return self.recording.whiten(cause.observation_shift(self.data, constants), self.frames)
+        names = cause.names(constants)
         out = np.zeros((len(self.row_pose), len(names)))
-        if family.bases is not None:
-            for basis in family.bases(constants):
-                law = self._law(basis)
-                out[:, names.index(basis.parameter)] += self.motion[basis.frame, basis.kind] * law[self.row_pose]
+        for basis in cause.laws(constants):
+            law = self._law(basis)
+            out[:, names.index(basis.parameter)] += self.motion[basis.frame, basis.kind] * law[self.row_pose]
         return self.recording.beside_common(out)
 
     def _law(self, basis: Basis) -> Array:
@@ -85,12 +84,12 @@ def tangents(fit: Fit, recording: Recording) -> Tangents:
     )
 
 
-def entries(families: Sequence[Family], at: Tangents) -> list[Entry]:
-    """Columns of all families at all their grid points, scaled by the typical amplitudes."""
+def entries(causes: Sequence[LinearCause], at: Tangents) -> list[Entry]:
+    """Columns of all causes at all their grid points, scaled by the typical amplitudes."""
     out = []
-    for i, family in enumerate(families):
-        for g, constants in enumerate(family.grid):
-            columns = at.columns(family, constants) * family.sizes(constants)
+    for i, cause in enumerate(causes):
+        for g, constants in enumerate(cause.grid):
+            columns = at.columns(cause, constants) * cause.sizes(constants)
             if np.all(np.isfinite(columns)):
-                out.append(Entry(i, g, columns, family.positive))
+                out.append(Entry(i, g, columns, cause.positive))
     return out

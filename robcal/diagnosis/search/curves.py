@@ -19,7 +19,7 @@ from robcal.diagnosis.core.recording import Recording
 from robcal.diagnosis.gain.heldout import folds, rms
 from robcal.diagnosis.scan.statistics import log_f_probability
 from robcal.diagnosis.scan.tangents import tangents
-from robcal.physics.cause import Array, Family
+from robcal.physics.cause import Array, LinearCause, RobotCause
 from robcal.physics.empirical import periodic_curve
 from robcal.physics.site import RobotSite
 from robcal.robot.model import Term
@@ -31,9 +31,9 @@ BUMPS_A_TURN = (24, 36, 48, 72)
 ROWS_A_BUMP = 4.0
 """Measured numbers that are needed for each bump."""
 GAIN = 0.7
-"""Share of the square sum at kept-out poses below which the curves must come."""
+"""Share of the sum of squares at kept-out poses below which the curves must come."""
 LEAST_GAIN = 0.03
-"""Share of that square sum by which the kept-out poses must miss the curve of a joint for it to count."""
+"""Share of that sum of squares by which the kept-out poses must miss the curve of a joint for it to count."""
 WAVES = 2
 HIGHEST_WAVE = 60.0
 IRREGULAR = 0.35
@@ -67,8 +67,8 @@ class Curves:
 
     Attributes
     ----------
-    accepted : one family per joint with its amplitudes, to be fitted again with everything else.
-    shares : share of the square sum above the noise that each explains.
+    accepted : one cause per joint with its amplitudes, to be fitted again with everything else.
+    shares : share of the sum of squares above the noise that each explains.
     likenesses : joints whose curves are alike.
     p_value : of the F test of all curves together, for all scales tried.
     """
@@ -99,20 +99,20 @@ def find_curves(present: Fit, recording: Recording) -> Curves:
     site = RobotSite(present.model, at.variables, frozenset(present.free), frozenset())
     joints = [j for j in site.joints if not j.prismatic and site.varies(f"q{j.number}", 0.5)]
     label = folds(recording)[present.row_pose]
-    best: tuple[float, _Folded, list[Family], list[Array]] | None = None
+    best: tuple[float, _Folded, list[RobotCause], list[Array]] | None = None
     for count in BUMPS_A_TURN:
-        families = [periodic_curve(j, site.variables[f"q{j.number}"], count) for j in joints]
-        columns = [at.columns(f, f.grid[0]) * f.sizes(f.grid[0]) for f in families]
+        causes = [periodic_curve(j, site.variables[f"q{j.number}"], count) for j in joints]
+        columns = [at.columns(f, f.grid[0]) * f.sizes(f.grid[0]) for f in causes]
         visited = sum(_visited(site.variables[f"q{j.number}"], count) for j in joints)
         if ROWS_A_BUMP * visited > len(present.residual):
             break
         folded = _folded(present, columns, label)
         after = folded.kept_out(range(len(columns)))
         if best is None or after < best[0]:
-            best = after, folded, families, columns
+            best = after, folded, causes, columns
     if best is None:
         return Curves()
-    after, folded, families, columns = best
+    after, folded, causes, columns = best
     before = folded.kept_out(())
     if after > GAIN * before:
         return Curves()
@@ -124,7 +124,7 @@ def find_curves(present: Fit, recording: Recording) -> Curves:
         for k in everyone
         if matters[k]
         and _irregularity(
-            families[k], values[k] * families[k].sizes(families[k].grid[0]), site.variables[f"q{joints[k].number}"]
+            causes[k], values[k] * causes[k].sizes(causes[k].grid[0]), site.variables[f"q{joints[k].number}"]
         )
         > IRREGULAR
     ]
@@ -143,7 +143,7 @@ def find_curves(present: Fit, recording: Recording) -> Curves:
         np.array([square - left @ left]), np.array([count]), np.array([square]), len(r) - present.jacobian.shape[1]
     )
     accepted = tuple(
-        Accepted(f := families[k], f.grid[0], v * f.sizes(f.grid[0]), np.zeros((len(v), len(v))))
+        Accepted(f := causes[k], f.grid[0], v * f.sizes(f.grid[0]), np.zeros((len(v), len(v))))
         for k, v in zip(keep, values, strict=True)
     )
     alike = likenesses(accepted, [site.variables[f"q{joints[k].number}"] for k in keep])
@@ -157,18 +157,18 @@ def _visited(angles: Array, bumps: int) -> int:
 
 def frozen_terms(item: Accepted) -> tuple[Term, ...]:
     """Terms with the amplitudes as numbers."""
-    bases = item.family.bases(item.constants) if item.family.bases is not None else ()
+    bases = item.cause.laws(item.constants)
     parts = [f"{float(v)!r}*({b.expression})" for b, v in zip(bases, item.values, strict=True)]
     return tuple(
-        Term(f"{item.family.where}_held_{k}", bases[0].frame, bases[0].kind, " + ".join(parts[k : k + 24]))
+        Term(f"{item.cause.where}_held_{k}", bases[0].frame, bases[0].kind, " + ".join(parts[k : k + 24]))
         for k in range(0, len(parts), 24)
     )
 
 
 def curve(item: Accepted, angles: Array) -> Array:
     """Value (n,) of an accepted curve at angles (n,) of its joint, rad."""
-    name = item.family.covariates[0]
-    bases = item.family.bases(item.constants) if item.family.bases is not None else ()
+    name = item.cause.covariates[0]
+    bases = item.cause.laws(item.constants)
     return np.asarray(np.sum([v * b.value({name: angles}) for b, v in zip(bases, item.values, strict=True)], axis=0))
 
 
@@ -180,8 +180,8 @@ def nested_errors(
     At the poses to verify, or else at folds of the recording.
     """
     at = tangents(present, recording)
-    sizes = np.concatenate([item.family.sizes(item.constants) for item in accepted])
-    X = np.column_stack([_scaled(present), *(at.columns(a.family, a.constants) for a in accepted)])
+    sizes = np.concatenate([item.cause.sizes(item.constants) for item in accepted])
+    X = np.column_stack([_scaled(present), *(at.columns(a.cause, a.constants) for a in accepted)])
     p = len(present.free)
     X[:, p:] *= sizes
     r = present.residual
@@ -222,7 +222,7 @@ def _at_other_poses(present: Fit, recording: Recording, accepted: Sequence[Accep
     row_pose = np.repeat(pose, len(residual) // len(pose))
     there = replace(present, inputs=inputs, frames=frames, residual=residual, jacobian=jacobian, row_pose=row_pose)
     at = tangents(there, recording)
-    return there, np.column_stack([jacobian, *(at.columns(a.family, a.constants) for a in accepted)])
+    return there, np.column_stack([jacobian, *(at.columns(a.cause, a.constants) for a in accepted)])
 
 
 @dataclass(frozen=True)
@@ -254,7 +254,7 @@ class _Folded:
     variance: float
 
     def kept_out(self, joints: Iterable[int]) -> float:
-        """Square sum of the residuals that the other folds predict with the curves of the given joints."""
+        """sum of squares of the residuals that the other folds predict with the curves of the given joints."""
         fitted = int(self.ends[0])
         at = np.concatenate([np.arange(fitted), *(np.arange(self.ends[k], self.ends[k + 1]) for k in joints)])
         gram = np.sum([f[0] for f in self.folds], axis=0)[np.ix_(at, at)]
@@ -297,9 +297,9 @@ def _solve(present: Fit, columns: Sequence[Array]) -> list[Array]:
     return [x[a:b] for a, b in pairwise(ends)]
 
 
-def _irregularity(family: Family, values: Array, angles: Array) -> float:
+def _irregularity(cause: LinearCause, values: Array, angles: Array) -> float:
     """Share of a curve's variance at the recorded angles that a few waves of any order leave."""
-    left = curve(Accepted(family, family.grid[0], values, np.zeros((0, 0))), angles)
+    left = curve(Accepted(cause, cause.grid[0], values, np.zeros((0, 0))), angles)
     left = left - np.mean(left)
     total = float(left @ left)
     if total == 0.0:
@@ -356,8 +356,8 @@ def likenesses(accepted: Sequence[Accepted], angles: Sequence[Array]) -> tuple[L
                     r = float(a @ b) / max(float(np.sqrt((a @ a) * (b @ b))), 1e-300)
                     if r > ALIKE and (best is None or r > best.correlation):
                         best = Likeness(
-                            accepted[j].family.where,
-                            accepted[i].family.where,
+                            accepted[j].cause.where,
+                            accepted[i].cause.where,
                             sense,
                             shift * 2.0 * np.pi / steps,
                             r,

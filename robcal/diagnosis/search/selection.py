@@ -18,15 +18,15 @@ from robcal.diagnosis.scan.analysis import Analysis, accepted_from, analyse, ext
 from robcal.diagnosis.scan.family_wise import FamilyWise
 from robcal.diagnosis.scan.posterior import refine
 from robcal.diagnosis.scan.statistics import orthonormal_basis
-from robcal.physics.cause import Array, Constants, Family, Key
-from robcal.physics.prior_scale import usual_size
+from robcal.physics.cause import Array, Constants, Key, LinearCause
+from robcal.physics.prior_scale import prior_scale
 from robcal.robot.model import RobotModel
 
 SAME_SCATTER = 0.2
 """Relative change of the joints' variance that changes no decision."""
-DOUBT = 6.0
+LEFT_AT_PLACE_PENALTY = 6.0
 """Evidence that a law loses by leaving something significant at its own place: two causes there are rare."""
-SECOND = 3.0
+SECOND_CAUSE_PENALTY = 3.0
 """Evidence that the name for what is left must have before it counts: most recordings have one cause at most."""
 VISIBLE_SIGMA = 5.0
 """Signal in sigma from which a parameter of usual size is worth fitting."""
@@ -39,13 +39,13 @@ class SelectionSettings:
     Attributes
     ----------
     level : family-wise level of a mismatch.
-    further : share of that level which causes beside a first one must reach: each look is another chance to be wrong.
+    further : share of that level which causes beside a first one must reach: each is another chance to be wrong.
     most : causes at most.
     blunder_log_p : logarithm of the probability (all observations weighed in) below which one is a gross error.
     blunder_share : share of the observations that may be left out as gross errors.
     runs : simulations for the family-wise level.
     least_kept : share of the linear promise that a refit must keep.
-    most_futile : families that may break their promise before a step gives up.
+    most_futile : causes that may break their promise before a step gives up.
     """
 
     level: float = 0.01
@@ -67,10 +67,10 @@ class Selection:
     recording : without the observations that were left out.
     accepted : causes in the order in which they were found.
     p_values : family-wise, of the scan in which each was found.
-    first, last : looks at the first fit and at the last one.
+    first, last : analyses at the first fit and at the last one.
     free, tied : fitted and eliminated parameters at the end.
     blunders : observations left out: (index in the recording given, its pose's row).
-    without : with several causes, looks at the fits without one of them each, in their order.
+    without : with several causes, analyses at the fits without one of them each, in their order.
     """
 
     recording: Recording
@@ -109,15 +109,15 @@ def select(
     present = fit(model, recording, free)
     while True:
         known = level if first is None else first.family_wise
-        look = analyse(present, recording, tied, runs=settings.runs, level=known)
-        seen = newly_visible(look, tied) if accepted else ()
+        analysis = analyse(present, recording, tied, runs=settings.runs, level=known)
+        seen = newly_visible(analysis, tied) if accepted else ()
         if seen:
             free, tied = (*free, *seen), tied - set(seen)
             present = fit(model, recording, free, accepted)
             continue
-        first = first or look
-        if _is_blunder(look, settings) and len(left_out) < most_blunders:
-            rows = list(look.suspect.observations)
+        first = first or analysis
+        if _is_blunder(analysis, settings) and len(left_out) < most_blunders:
+            rows = list(analysis.suspect.observations)
             left_out.extend((int(number[row]), int(recording.observations.pose[row])) for row in rows)
             number = np.delete(number, rows)
             recording = recording.without_observations(np.array(rows))
@@ -131,12 +131,12 @@ def select(
             present, weighed = fit(model, recording, free, accepted), True
             continue
         trial = None
-        if look.p_value <= _level(look, accepted, settings) and len(accepted) < settings.most:
-            trial = _extended(model, recording, free, look, barred, settings, tell)
+        if analysis.p_value <= _level(analysis, accepted, settings) and len(accepted) < settings.most:
+            trial = _extended(model, recording, free, analysis, barred, settings, tell)
         if trial is not None:
             accepted = trial.accepted
             recording, present = _weighed(model, recording, free, trial)
-            p_values.append(look.p_value)
+            p_values.append(analysis.p_value)
             continue
         if settled or len(accepted) < 2:
             break
@@ -147,7 +147,9 @@ def select(
         if without:
             break
         present = fit(model, recording, free, accepted)
-    return Selection(recording, present.accepted, tuple(p_values), first, look, free, tied, tuple(left_out), without)
+    return Selection(
+        recording, present.accepted, tuple(p_values), first, analysis, free, tied, tuple(left_out), without
+    )
 
 
 def _weighed(model: RobotModel, recording: Recording, free: tuple[str, ...], present: Fit) -> tuple[Recording, Fit]:
@@ -159,10 +161,10 @@ def _weighed(model: RobotModel, recording: Recording, free: tuple[str, ...], pre
     return again, fit(model, again, free, present.accepted)
 
 
-def _level(look: Analysis, accepted: tuple[Accepted, ...], settings: SelectionSettings) -> float:
+def _level(analysis: Analysis, accepted: tuple[Accepted, ...], settings: SelectionSettings) -> float:
     """Level that the next cause must reach; what is left where a cause was named already puts the name in doubt."""
-    place = look.families[look.top(np.ones(len(look.families), dtype=bool))].where
-    elsewhere = bool(accepted) and all(item.family.where != place for item in accepted)
+    place = analysis.causes[analysis.most_probable(np.ones(len(analysis.causes), dtype=bool))].where
+    elsewhere = bool(accepted) and all(item.cause.where != place for item in accepted)
     return settings.level * (settings.further if elsewhere else 1.0)
 
 
@@ -170,47 +172,47 @@ def _extended(
     model: RobotModel,
     recording: Recording,
     free: tuple[str, ...],
-    look: Analysis,
+    analysis: Analysis,
     barred: set[Key],
     settings: SelectionSettings,
     tell: Callable[[str], None],
 ) -> Fit | None:
-    """The fit with the best family added; families whose refit does not keep the linear promise are barred."""
+    """The fit with the best cause added; causes whose refit does not keep the linear promise are barred."""
     for _ in range(settings.most_futile):
-        open_to = np.array([family.key not in barred for family in look.families])
-        choice = choose(look, open_to, settings.level)
+        open_to = np.array([cause.key not in barred for cause in analysis.causes])
+        choice = choose(analysis, open_to, settings.level)
         if choice is None:
             return None
-        family, constants = choice
-        added = accepted_from(look, family, constants)
-        trial = fit(model, recording, free, (*look.fit.accepted, added))
-        gain = float(look.fit.residual @ look.fit.residual - trial.residual @ trial.residual)
-        if gain > settings.least_kept * promised(look, added):
-            tell(f"{added.family.cause} at {added.family.where}: p {look.p_value:.2g}")
+        cause, constants = choice
+        added = accepted_from(analysis, cause, constants)
+        trial = fit(model, recording, free, (*analysis.fit.accepted, added))
+        gain = float(analysis.fit.residual @ analysis.fit.residual - trial.residual @ trial.residual)
+        if gain > settings.least_kept * promised(analysis, added):
+            tell(f"{added.cause.name} at {added.cause.where}: p {analysis.p_value:.2g}")
             return trial
-        barred.add(added.family.key)
+        barred.add(added.cause.key)
     return None
 
 
-def promised(look: Analysis, added: Accepted) -> float:
-    """Drop of the whitened square sum that the linear problem promises for an added cause."""
-    columns = look.at.columns(added.family, added.constants)
-    basis = orthonormal_basis(columns - look.basis @ (look.basis.T @ columns))
-    return float(np.sum((basis.T @ look.residual) ** 2))
+def promised(analysis: Analysis, added: Accepted) -> float:
+    """Drop of the whitened sum of squares that the linear problem promises for an added cause."""
+    columns = analysis.at.columns(added.cause, added.constants)
+    basis = orthonormal_basis(columns - analysis.basis @ (analysis.basis.T @ columns))
+    return float(np.sum((basis.T @ analysis.residual) ** 2))
 
 
-def newly_visible(look: Analysis, tied: frozenset[str]) -> tuple[str, ...]:
+def newly_visible(analysis: Analysis, tied: frozenset[str]) -> tuple[str, ...]:
     """Parameters that were eliminated as dependent but show now that a cause is in the model.
 
     A tilted base, for one, gives the vertical axis a load torque and makes its elasticity identifiable.
     """
     seen: list[str] = []
-    basis = look.basis
+    basis = analysis.basis
     for name in sorted(tied):
-        column = look.at.parameters.get(name)
+        column = analysis.at.parameters.get(name)
         if column is None:
             continue
-        column = column * usual_size(name, look.at.variables)
+        column = column * prior_scale(name, analysis.at.variables)
         rest = column - basis @ (basis.T @ column)
         if np.linalg.norm(rest) > VISIBLE_SIGMA:
             seen.append(name)
@@ -218,43 +220,49 @@ def newly_visible(look: Analysis, tied: frozenset[str]) -> tuple[str, ...]:
     return tuple(seen)
 
 
-def _is_blunder(look: Analysis, settings: SelectionSettings) -> bool:
-    groups = len(look.at.recording.observations.pose)
-    significant = look.suspect.log_p + np.log(groups) < settings.blunder_log_p
-    return bool(significant and look.suspect.log_evidence > np.max(look.ranked.log_weight))
+def _is_blunder(analysis: Analysis, settings: SelectionSettings) -> bool:
+    groups = len(analysis.at.recording.observations.pose)
+    significant = analysis.suspect.log_p + np.log(groups) < settings.blunder_log_p
+    return bool(significant and analysis.suspect.log_evidence > np.max(analysis.ranked.log_weight))
 
 
-def _beside(family: Family, after: Analysis, level: float) -> float:
-    """What speaks for a family beyond its own evidence: the best name for what it leaves; what it leaves where it acts
+def _beside(cause: LinearCause, after: Analysis, level: float) -> float:
+    """What speaks for a cause beyond its own evidence: the best name for what it leaves; what it leaves where it acts
     itself speaks against it."""
-    left = after.families[after.top(np.ones(len(after.families), dtype=bool))]
-    if after.p_value <= level and (left.where, left.direction) == (family.where, family.direction):
-        return -DOUBT
+    left = after.causes[after.most_probable(np.ones(len(after.causes), dtype=bool))]
+    if after.p_value <= level and (left.where, left.direction) == (cause.where, cause.direction):
+        return -LEFT_AT_PLACE_PENALTY
     others = float(np.max(np.where(after.named, after.ranked.log_weight, -np.inf), initial=-np.inf))
-    return max(others - SECOND, 0.0)
+    return max(others - SECOND_CAUSE_PENALTY, 0.0)
 
 
-def choose(look: Analysis, open_to: Array | None = None, level: float = DEFAULTS.level) -> tuple[int, Constants] | None:
-    """The family to be added: best name or, where that explains less, the best empirical term.
+def choose(
+    analysis: Analysis, open_to: Array | None = None, level: float = DEFAULTS.level
+) -> tuple[int, Constants] | None:
+    """The cause to be added: best name or, where that explains less, the best empirical term.
 
-    Only families that a test finds by themselves: evidence alone would take whatever costs little and explains nothing
+    Only causes that a test finds by themselves: evidence alone would take whatever costs little and explains nothing
     where the effect has many parameters, each against a wide prior.
     """
     options: list[tuple[float, int, Constants]] = []
-    allowed = look.significant() if open_to is None else look.significant() & open_to
-    kinds = [look.named & allowed, ~look.named & allowed]
-    tops = [look.top(chosen) for chosen in kinds if np.any(chosen & np.isfinite(look.ranked.log_weight))]
-    for family in tops:
-        constants = refine(look.families[family], look.constants(family), look.at, look.basis, look.residual)
+    allowed = analysis.significant() if open_to is None else analysis.significant() & open_to
+    kinds = [analysis.named & allowed, ~analysis.named & allowed]
+    tops = [
+        analysis.most_probable(chosen) for chosen in kinds if np.any(chosen & np.isfinite(analysis.ranked.log_weight))
+    ]
+    for cause in tops:
+        constants = refine(
+            analysis.causes[cause], analysis.constants(cause), analysis.at, analysis.basis, analysis.residual
+        )
         if len(tops) == 1:
-            return family, constants
-        after = extend(look, look.at.columns(look.families[family], constants))
-        value = float(look.ranked.log_weight[family]) + _beside(look.families[family], after, level)
-        options.append((value, family, constants))
+            return cause, constants
+        after = extend(analysis, analysis.at.columns(analysis.causes[cause], constants))
+        value = float(analysis.ranked.log_weight[cause]) + _beside(analysis.causes[cause], after, level)
+        options.append((value, cause, constants))
     if not options:
         return None
-    _, family, constants = max(options, key=lambda option: option[0])
-    return family, constants
+    _, cause, constants = max(options, key=lambda option: option[0])
+    return cause, constants
 
 
 def _backward(
@@ -269,44 +277,44 @@ def _backward(
 ) -> tuple[tuple[Accepted, ...], list[float], tuple[Analysis, ...]]:
     """With all others in the model: is each cause still needed, and is its name still the best?
 
-    Also returns the looks without one of them each, if all of them stay.
+    Also returns the analyses without one of them each, if all of them stay.
     """
     accepted = list(present.accepted)
     probabilities = list(p_values)
-    looks: list[Analysis] = []
+    analyses: list[Analysis] = []
     changed = False
     k = 0
     while k < len(accepted) and len(accepted) > 1:
         others = tuple(accepted[:k] + accepted[k + 1 :])
-        look = analyse(fit(model, recording, free, others), recording, tied, level=level)
-        looks.append(look)
-        if look.p_value > settings.level:
-            accepted = list(look.fit.accepted)
+        analysis = analyse(fit(model, recording, free, others), recording, tied, level=level)
+        analyses.append(analysis)
+        if analysis.p_value > settings.level:
+            accepted = list(analysis.fit.accepted)
             del probabilities[k]
             changed = True
             continue
-        choice = choose(look, level=settings.level)
+        choice = choose(analysis, level=settings.level)
         if choice is None:
             k += 1
             continue
-        family, constants = choice
-        if look.families[family].key != accepted[k].family.key and _gain(look, family, accepted[k]) > 3.0:
-            accepted = list(look.fit.accepted)
-            accepted.insert(k, accepted_from(look, family, constants))
+        cause, constants = choice
+        if analysis.causes[cause].key != accepted[k].cause.key and _gain(analysis, cause, accepted[k]) > 3.0:
+            accepted = list(analysis.fit.accepted)
+            accepted.insert(k, accepted_from(analysis, cause, constants))
             changed = True
         k += 1
-    return tuple(accepted), probabilities, () if changed else tuple(looks)
+    return tuple(accepted), probabilities, () if changed else tuple(analyses)
 
 
-def _gain(look: Analysis, family: int, present: Accepted) -> float:
-    """Logarithm of the posterior odds of a family against the one that stands."""
-    standing = [f for f, other in enumerate(look.families) if other.key == present.family.key]
-    weight = max((float(look.ranked.log_weight[f]) for f in standing), default=-np.inf)
-    return float(look.ranked.log_weight[family]) - weight
+def _gain(analysis: Analysis, cause: int, present: Accepted) -> float:
+    """Logarithm of the posterior odds of a cause against the one that stands."""
+    standing = [f for f, other in enumerate(analysis.causes) if other.key == present.cause.key]
+    weight = max((float(analysis.ranked.log_weight[f]) for f in standing), default=-np.inf)
+    return float(analysis.ranked.log_weight[cause]) - weight
 
 
 def poses_that_carry(signature: Array, row_pose: Array, names: tuple[str, ...], most: int = 20) -> tuple[str, ...]:
-    """Poses that carry half of a projected signature's square sum, strongest first."""
+    """Poses that carry half of a projected signature's sum of squares, strongest first."""
     power = np.bincount(row_pose, weights=signature**2, minlength=len(names))
     order = np.argsort(-power)
     share = np.cumsum(power[order]) / max(power.sum(), 1e-300)

@@ -24,7 +24,7 @@ from robcal.photogrammetry.bundle.datum import Datum
 from robcal.photogrammetry.bundle.determinacy import intrinsics_basis
 from robcal.photogrammetry.bundle.lengths import rows_of
 from robcal.photogrammetry.bundle.operator import problem_of
-from robcal.photogrammetry.bundle.result import finish
+from robcal.photogrammetry.bundle.result import NetworkContext, finish
 from robcal.photogrammetry.bundle.solver import Bars
 from robcal.photogrammetry.core.camera import Camera
 from robcal.photogrammetry.core.network import CameraNetwork, ImageMarks, Lengths
@@ -156,18 +156,15 @@ def adjust_with_colmap(
     )
     state = replace(state, camera=camera, camera_T_body=frame.stations(poses), points=frame.points(points))
     note = "engine pycolmap: marks weighted alike, k3 = 0, scale bars used for the scale only"
-    return finish(
-        problem,
-        state,
-        SolveSummary(True, 0, "by COLMAP", network.summary.cost_start, network.summary.cost),
-        free=free,
-        left_out=(*network.left_out, ("k3", "not separable in COLMAP's models")),
-        image_names=network.image_names,
-        ids=network.ids,
-        rejected=network.rejected,
-        lengths=lengths,
-        check_lengths=check_lengths or Lengths.none(),
-        notes=(*network.notes, note),
-        variance_components=True,
-        iterate=False,
+    context = NetworkContext(
+        free,
+        (*network.left_out, ("k3", "not separable in COLMAP's models")),
+        network.image_names,
+        network.ids,
+        network.rejected,
+        lengths,
+        check_lengths or Lengths.none(),
+        (*network.notes, note),
     )
+    summary = SolveSummary(True, 0, "by COLMAP", network.summary.cost_start, network.summary.cost)
+    return finish(problem, state, summary, context, variance_components=True, iterate=False)

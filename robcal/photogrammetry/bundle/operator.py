@@ -8,11 +8,11 @@ import numpy as np
 from scipy import stats
 
 from robcal.errors import InvalidInput
+from robcal.photogrammetry.bundle.covariance import factorise
 from robcal.photogrammetry.bundle.datum import Datum
 from robcal.photogrammetry.bundle.determinacy import intrinsics_basis
 from robcal.photogrammetry.bundle.lengths import rows_of
-from robcal.photogrammetry.bundle.normals import Factor, Linearised, LinearisedLengths, MarkOrder, State, build_normals
-from robcal.photogrammetry.bundle.normals import linearise as linearise_marks
+from robcal.photogrammetry.bundle.normals import MarkOrder, State
 from robcal.photogrammetry.bundle.solver import Bars, Problem
 from robcal.photogrammetry.core.network import CameraNetwork, Lengths
 from robcal.transforms import Array
@@ -62,11 +62,8 @@ class NetworkOperator:
         self.network = network
         problem, state = problem_of(network, lengths)
         self.problem, self.state = problem, state
-        self.lin: Linearised = linearise_marks(state, problem.order, problem.basis, problem.shift(state))
+        self.lin, self.factor = factorise(problem, state)
         self.root = np.sqrt(problem.weights)
-        bars: LinearisedLengths = problem.linearised_bars(state.points)
-        normals = build_normals(self.lin, problem.weights, problem.order, bars)
-        self.factor = Factor(normals, problem.constraints(state.points), problem.held(len(state.points)))
         self.J = self.lin.J * self.root[:, None, None]
 
     @property

@@ -158,6 +158,15 @@ def line_ratio(points: ArrayLike) -> float:
     return float(s[1] / s[0]) if s[0] > 0 else 0.0
 
 
+_ACROSS = 0.02
+"""Targets whose spread across their line is below this share of that along it carry no frame."""
+
+
+def spans_plane(points: ArrayLike) -> bool:
+    """True if points (n, 3) carry a frame: at least three, and not (nearly) in one line."""
+    return line_ratio(points) >= _ACROSS
+
+
 def pairs(n: int) -> IntArray:
     """All index pairs (k, 2) with i < j of n items."""
     return np.array(list(combinations(range(n), 2)), dtype=np.int64).reshape(-1, 2)

@@ -16,7 +16,7 @@ from scipy import stats
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 
-from robcal.photogrammetry.core.bodies import Body, IntArray, line_ratio
+from robcal.photogrammetry.core.bodies import Body, IntArray, spans_plane
 from robcal.photogrammetry.core.camera import Camera, normalise, project
 from robcal.photogrammetry.orientation.p3p import three_point_poses
 from robcal.photogrammetry.orientation.resection import refine_poses
@@ -70,7 +70,7 @@ def search_body(
         return [], f"{n} uncoded targets with coordinates cannot be told apart by geometry; four or more are needed"
     if m < 4:
         return [], f"only {m} dots in the image"
-    if line_ratio(body.points[candidates]) < 0.02:
+    if not spans_plane(body.points[candidates]):
         return [], "the targets lie in one line"
     ideal = normalise(camera, xy)
     tree = cKDTree(xy)
@@ -235,7 +235,7 @@ def _verify(
         for k, places in enumerate(predicted):
             targets, rows = match_dots(places, radius, xy, unique=False)
             key = np.stack([targets, rows]).tobytes()
-            enough = len(rows) >= 4 and line_ratio(body.points[candidates[targets]]) > 0.02
+            enough = len(rows) >= 4 and spans_plane(body.points[candidates[targets]])
             if enough and key not in unique:
                 unique[key] = k
                 matches.append((targets, rows))

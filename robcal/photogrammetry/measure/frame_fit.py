@@ -6,8 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from robcal.estimation.batched import NormalEquations, minimise_each
+from robcal.estimation.grouping import members, sum_by, whitener
+from robcal.estimation.summary import TerminationSettings
 from robcal.photogrammetry.core.bodies import Body, IntArray
-from robcal.photogrammetry.core.grouping import sum_by, whitener
 from robcal.transforms import Array, fit_frame, retract, skew, transform
 
 
@@ -33,7 +35,7 @@ def fit_frames(
     body: Body,
     station_jacobian: Array | None = None,
     station_covariance: Array | None = None,
-    iterations: int = 6,
+    iterations: int = 10,
 ) -> FrameFit:
     """Fit body_T onto points: weights from the points' noise plus the body's own (marginal) uncertainty.
 
@@ -60,21 +62,20 @@ def fit_frames(
     T = np.array([fit_frame(p_world[g], X[g]) for g in groups])
     own = np.array([body.marginal(i) for i in range(len(body))])[row]
 
-    for _ in range(iterations):
-        R = T[index][:, :3, :3]
-        W = whitener(covariance + R @ own @ np.swapaxes(R, -1, -2))
-        J = W @ np.concatenate([R, -R @ skew(X)], axis=-1)
-        r = np.einsum("mij,mj->mi", W, p_world - transform(T[index], X))
-        N = sum_by(index, np.swapaxes(J, -1, -2) @ J, n)
-        g = sum_by(index, np.einsum("mij,mi->mj", J, r), n)
-        step = np.linalg.solve(N, g[..., None])[..., 0]
-        T = retract(T, step)
-        if np.max(np.abs(step)) < 1e-11:
-            break
-    R = T[index][:, :3, :3]
-    W = whitener(covariance + R @ own @ np.swapaxes(R, -1, -2))
-    J = W @ np.concatenate([R, -R @ skew(X)], axis=-1)
-    r = np.einsum("mij,mj->mi", W, p_world - transform(T[index], X))
+    def whitened(frames: Array, rows: IntArray, place: IntArray) -> tuple[Array, Array, Array, Array]:
+        R = frames[place][:, :3, :3]
+        W = whitener(covariance[rows] + R @ own[rows] @ np.swapaxes(R, -1, -2))
+        J = W @ np.concatenate([R, -R @ skew(X[rows])], axis=-1)
+        r = np.einsum("mij,mj->mi", W, p_world[rows] - transform(frames[place], X[rows]))
+        return r, J, W, R
+
+    def equations(frames: Array, chosen: IntArray) -> NormalEquations:
+        rows, place = members(index, chosen, n)
+        r, J, _, _ = whitened(frames, rows, place)
+        return NormalEquations.of_rows(place, r, J, len(chosen))
+
+    T = minimise_each(equations, retract, T, TerminationSettings(iterations, negligible=1e-10)).state
+    r, J, W, R = whitened(T, np.arange(len(index)), index)
     Q = np.linalg.inv(sum_by(index, np.swapaxes(J, -1, -2) @ J, n))
     K = Q[index] @ np.swapaxes(J, -1, -2) @ W
     noise = sum_by(index, K @ covariance @ np.swapaxes(K, -1, -2), n)

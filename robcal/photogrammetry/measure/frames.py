@@ -2,63 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
 from robcal.errors import DegenerateGeometry, InvalidInput
-from robcal.photogrammetry.core.bodies import Body, IntArray, line_ratio
-from robcal.photogrammetry.measure.distance_criterion import (
-    PairTable,
-    body_pair_variance,
-    culprits,
-    make_pairs,
-    robust_scale,
-)
+from robcal.photogrammetry.core.bodies import Body, IntArray, spans_plane
+from robcal.photogrammetry.measure.distance_criterion import make_pairs
+from robcal.photogrammetry.measure.elimination import PoseFault, RejectedPose, eliminate
 from robcal.photogrammetry.measure.frame_fit import FrameFit, fit_frames
 from robcal.photogrammetry.measure.measured_points import MeasuredPoints, RejectedPoint
+from robcal.photogrammetry.measure.pair_deviations import (
+    TOO_MANY,
+    PairDeviations,
+    judge_pairs,
+    noise_from_lengths,
+    shared_variance,
+)
 from robcal.photogrammetry.measure.recurring import Recurring, find_recurring
 from robcal.photogrammetry.measure.unknown_body import body_from_points
 from robcal.transforms import Array
 
-_SPREAD = 0.02
-_MISFIT = "lengths agree but the body does not fit"
-_TOO_MANY = 0.3
-"""Where more than this share of the poses violate a fixed tolerance, the violations are evidence, not blunders."""
-
-
-@dataclass(frozen=True)
-class RejectedPose:
-    """A pose without a frame, and why."""
-
-    pose: int
-    reason: str
-
-
-@dataclass(frozen=True)
-class PairDeviations:
-    """Every pair judged: ``pose`` (k,), ``first``, ``second`` ids, ``measured``, ``expected`` (m), ``sigma`` (m),
-    ``tolerance`` (m), ``accepted`` (k,) bool. ``expected`` is the body's length (with recurring deviations, see
-    :class:`Recurring`, taken over from the mean of the poses for the judgement only)."""
-
-    pose: IntArray
-    first: IntArray
-    second: IntArray
-    measured: Array
-    body: Array
-    expected: Array
-    sigma: Array
-    tolerance: Array
-    accepted: NDArray[np.bool_]
-
-    @property
-    def deviation(self) -> Array:
-        """Measured minus the body's own length, m."""
-        return self.measured - self.body
+FrameMethod = Literal["points", "resection", "gram_schmidt"]
 
 
 @dataclass(frozen=True)
@@ -83,7 +51,7 @@ class MeasuredFrames:
     world_T_body: Array
     covariance: Array
     common_covariance: Array
-    method: tuple[str, ...]
+    method: tuple[FrameMethod, ...]
     targets: tuple[tuple[int, ...], ...]
     chi2: Array
     redundancy: IntArray
@@ -96,6 +64,20 @@ class MeasuredFrames:
     body: Body
     sigma: float | None
     notes: tuple[str, ...] = field(default=())
+
+
+@dataclass(frozen=True)
+class _BodyPoints:
+    """Points of a body, m of them: row of the measured points and of the body, pose, coordinates and covariance."""
+
+    at: IntArray
+    row: IntArray
+    pose: IntArray
+    p_world: Array
+    covariance: Array
+
+    def select(self, keep: NDArray[np.bool_]) -> _BodyPoints:
+        return _BodyPoints(self.at[keep], self.row[keep], self.pose[keep], self.p_world[keep], self.covariance[keep])
 
 
 def measure_frames(
@@ -116,74 +98,38 @@ def measure_frames(
     """
     if tolerance is not None and not tolerance > 0:
         raise InvalidInput(f"the distance tolerance must be above zero, got {tolerance}")
-    method = "points"
     own = points.n_cameras != 1 if points.resected is not None else np.ones(len(points.pose), dtype=bool)
-    notes: list[str] = []
-    if body is None or body.known.sum() < 3:
-        body = body_from_points(points, own, None if body is None else body.ids)
-        method = "gram_schmidt"
-        notes.append("the body has no coordinates: frames by Gram-Schmidt from its targets (first to second is x)")
-    elif line_ratio(body.points[body.known]) < _SPREAD:
-        raise DegenerateGeometry(
-            f"all targets of body {body.name} lie in one line: they carry no frame; put a target beside the line"
-        )
-    row = body.index(points.target)
-    known = np.zeros(len(row), dtype=bool)
-    known[row >= 0] = body.known[row[row >= 0]]
-    use = own & known
-    rejected = list(points.rejected)
-    rejected += [
-        RejectedPoint(int(points.pose[i]), int(points.target[i]), f"not a target of body {body.name} with coordinates")
-        for i in np.flatnonzero(own & ~known)
-    ]
-    at = np.flatnonzero(use)
-    pose, row, p = points.pose[at], row[at], points.p_world[at]
-    sigma = None
-    if points.covariance is None:
-        sigma = _noise_from_lengths(body, pose, row, p)
-        C = np.broadcast_to(sigma**2 * np.eye(3), (len(at), 3, 3)).copy()
-    else:
-        C = points.covariance[at]
-    table = make_pairs(pose, row, p, C)
-    shared = _shared_variance(points, at, table)
-    recurring = find_recurring(body, table, pose, row, p, shared)
-    judged, factor, note = _judge(body, table, recurring, shared, tolerance, sigma_factor)
+    body, method, notes = _body_with_coordinates(points, own, body)
+    used, sigma, foreign = _points_of_body(points, own, body)
+    table = make_pairs(used.pose, used.row, used.p_world, used.covariance)
+    shared = shared_variance(points, used.at, table)
+    recurring = find_recurring(body, table, used.pose, used.row, used.p_world, shared)
+    judged, factor, note = judge_pairs(body, table, recurring, shared, tolerance, sigma_factor)
     if note:
         notes.append(note)
-    left_out = _leave_out(body, recurring, notes)
-    keep, rejected_poses, dropped = _eliminate(body, pose, row, table, judged, left_out)
-    rejected += dropped
-    station = _station(points, at[keep])
-    fit = fit_frames(pose[keep], row[keep], p[keep], C[keep], body, station, points.station_covariance)
-    if sigma is not None and fit.redundancy.sum() >= 30:
-        # lengths gave a robust first value; the accepted fits give the efficient one
-        scale = float(np.sqrt(fit.chi2.sum() / fit.redundancy.sum()))
-        sigma *= scale
-        fit = replace(fit, covariance=fit.covariance * scale**2, chi2=fit.chi2 / scale**2)
-    reasons = [_bad_fit(fit.chi2[i], int(fit.redundancy[i]), fit.covariance[i], factor) for i in range(len(fit.pose))]
-    misfits = [r is not None and r.startswith(_MISFIT) for r in reasons]
-    if sum(misfits) > _TOO_MANY * len(reasons):
-        notes.append(f"in {sum(misfits)} of {len(reasons)} poses the body does not fit: evidence, not rejected")
-        reasons = [None if bad else r for r, bad in zip(reasons, misfits, strict=True)]
-    good = np.array([r is None for r in reasons], dtype=bool)
-    rejected_poses += [RejectedPose(int(q), r) for q, r in zip(fit.pose, reasons, strict=True) if r is not None]
-    out = _assemble(points, fit, good, method)
-    with_frame = set(out["pose"].tolist())
-    rejected_poses = [r for r in rejected_poses if r.pose not in with_frame]
-    named = {r.pose for r in rejected_poses} | with_frame
-    for q in np.unique(np.concatenate([points.pose, np.array([r.pose for r in points.rejected], dtype=np.int64)])):
-        if int(q) not in named:
-            reasons = [r.reason for r in points.rejected if r.pose == q]
-            rejected_poses.append(
-                RejectedPose(int(q), "fewer than three targets measured" + (f" ({reasons[0]})" if reasons else ""))
-            )
-    if len(out["pose"]) == 0:
+    left_out = _shifted_targets(body, recurring, notes)
+    eliminated = eliminate(body, used.pose, used.row, table, judged, left_out)
+    fit, sigma = _fit(points, used.select(eliminated.keep), body, sigma)
+    faults = _faults_of_fits(fit, factor, notes)
+    good = np.array([fault is None for fault in faults], dtype=bool)
+    frames = _with_resected(points, fit, good, method)
+    rejected_poses = _without_frame(
+        points, frames.pose, [*eliminated.poses, *(fault for fault in faults if fault is not None)]
+    )
+    if len(frames.pose) == 0:
         reason = rejected_poses[0].reason if rejected_poses else "no points of the body"
         raise DegenerateGeometry(f"no pose carries a frame of body {body.name}: {reason}")
     return MeasuredFrames(
-        **out,
-        rejected_poses=tuple(rejected_poses),
-        rejected_points=tuple(rejected),
+        frames.pose,
+        frames.world_T_body,
+        frames.covariance,
+        frames.common_covariance,
+        frames.method,
+        frames.targets,
+        frames.chi2,
+        frames.redundancy,
+        rejected_poses=rejected_poses,
+        rejected_points=(*points.rejected, *foreign, *eliminated.points),
         pairs=judged,
         recurring=recurring,
         left_out=left_out,
@@ -194,178 +140,125 @@ def measure_frames(
     )
 
 
-def _station(points: MeasuredPoints, at: IntArray) -> Array | None:
-    return None if points.station_jacobian is None else points.station_jacobian[at]
+def _body_with_coordinates(
+    points: MeasuredPoints, own: NDArray[np.bool_], body: Body | None
+) -> tuple[Body, FrameMethod, list[str]]:
+    """The body (from the points where it has no coordinates), how its frames are defined, and notes."""
+    if body is None or body.known.sum() < 3:
+        estimated = body_from_points(points, own, None if body is None else body.ids)
+        note = "the body has no coordinates: frames by Gram-Schmidt from its targets (first to second is x)"
+        return estimated, "gram_schmidt", [note]
+    if not spans_plane(body.points[body.known]):
+        raise DegenerateGeometry(
+            f"all targets of body {body.name} lie in one line: they carry no frame; put a target beside the line"
+        )
+    return body, "points", []
 
 
-def _shared_variance(points: MeasuredPoints, at: IntArray, table: PairTable) -> Array:
-    """(k,) variance of each pair's distance from the station's uncertainty."""
-    if points.station_jacobian is None or points.station_covariance is None or len(table) == 0:
-        return np.zeros(len(table))
-    J = points.station_jacobian[at[table.second]] - points.station_jacobian[at[table.first]]
-    along = np.einsum("ki,kij->kj", table.direction, J)
-    return np.maximum(np.einsum("ki,ij,kj->k", along, points.station_covariance, along), 0.0)
+def _points_of_body(
+    points: MeasuredPoints, own: NDArray[np.bool_], body: Body
+) -> tuple[_BodyPoints, float | None, list[RejectedPoint]]:
+    """Points of known targets, the noise estimated where none is stated, and points of no known target."""
+    row = body.index(points.target)
+    known = np.zeros(len(row), dtype=bool)
+    known[row >= 0] = body.known[row[row >= 0]]
+    reason = f"not a target of body {body.name} with coordinates"
+    foreign = [RejectedPoint(int(points.pose[i]), int(points.target[i]), reason) for i in np.flatnonzero(own & ~known)]
+    at = np.flatnonzero(own & known)
+    pose, row, p = points.pose[at], row[at], points.p_world[at]
+    if points.covariance is not None:
+        return _BodyPoints(at, row, pose, p, points.covariance[at]), None, foreign
+    sigma = noise_from_lengths(body, pose, row, p)
+    covariance = np.broadcast_to(sigma**2 * np.eye(3), (len(at), 3, 3)).copy()
+    return _BodyPoints(at, row, pose, p, covariance), sigma, foreign
 
 
-def _noise_from_lengths(body: Body, pose: IntArray, row: IntArray, p: Array) -> float:
-    """Isotropic standard deviation of a coordinate from the scatter of lengths about their medians over the poses.
-
-    With fewer than five poses from the deviations from the body itself. A length's variance is twice a coordinate's.
-    """
-    table = make_pairs(pose, row, p, np.zeros((len(pose), 3, 3)))
-    if len(table) == 0:
-        raise DegenerateGeometry("no pose has two targets of the body: lengths cannot be compared")
-    key = table.a * len(body) + table.b
-    unique, inverse, count = np.unique(key, return_inverse=True, return_counts=True)
-    expected = np.linalg.norm(body.points[table.b] - body.points[table.a], axis=1)
-    deviation = table.distance - expected
-    centred = np.full(len(table), np.nan)
-    for k in range(len(unique)):
-        if count[k] >= 5:
-            rows = inverse == k
-            centred[rows] = (deviation[rows] - np.median(deviation[rows])) * np.sqrt(count[k] / (count[k] - 1))
-    values = centred[np.isfinite(centred)]
-    if len(values) < 5:
-        values = deviation
-    return max(robust_scale(values) / np.sqrt(2.0), 1e-7)
-
-
-def _judge(
-    body: Body, table: PairTable, recurring: Recurring, shared: Array, tolerance: float | None, sigma_factor: float
-) -> tuple[PairDeviations, float, str | None]:
-    """Deviation, standard deviation and tolerance of every pair; the noise factor; what a fixed tolerance would do."""
-    a, b = table.a, table.b
-    file = np.linalg.norm(body.points[b] - body.points[a], axis=1)
-    expected = file * (1.0 + 1e-6 * (recurring.scale_ppm or 0.0))
-    marked = {(r.first, r.second) for r in recurring.pairs}
-    if marked:
-        measured = np.linalg.norm(recurring.mean_points[b] - recurring.mean_points[a], axis=1)
-        ids = np.column_stack([body.ids[a], body.ids[b]])
-        recurs = np.array([(int(i), int(j)) in marked or (int(j), int(i)) in marked for i, j in ids])
-        expected = np.where(recurs & np.isfinite(measured), measured, expected)
-    variance = table.variance + shared + body_pair_variance(body.points, body.covariance, a, b)
-    sigma = np.sqrt(np.maximum(variance, 1e-18))
-    off = table.distance - expected
-    factor = robust_scale(off / sigma) if len(table) >= 30 else 1.0
-    factor = float(np.clip(factor, 0.2, 1e6))
-    limit = np.full(len(table), tolerance) if tolerance is not None else sigma_factor * max(factor, 0.5) * sigma
-    poses = np.unique(table.pose)
-    violating = np.unique(table.pose[np.abs(off) > limit])
-    note = None
-    if len(poses) >= 5 and len(violating) > _TOO_MANY * len(poses):
-        text = f"{1e3 * tolerance:.3g} mm" if tolerance is not None else f"{sigma_factor:g} sigma"
-        note = f"{len(violating)} of {len(poses)} poses violate the tolerance of {text}: evidence, not rejected"
-        limit = np.maximum(limit, 2 * sigma_factor * max(factor, 1.0) * sigma)
-    pairs = PairDeviations(
-        table.pose, body.ids[a], body.ids[b], table.distance, file, expected, sigma, limit, np.abs(off) <= limit
-    )
-    return pairs, factor, note
-
-
-def _leave_out(body: Body, recurring: Recurring, notes: list[str]) -> tuple[int, ...]:
+def _shifted_targets(body: Body, recurring: Recurring, notes: list[str]) -> tuple[int, ...]:
     """Shifted targets are not used for frames as long as three others remain that span a plane."""
     ids = recurring.shifted_ids
     stay = body.known & ~np.isin(body.ids, ids)
-    if not ids:
-        return ()
-    if stay.sum() >= 3 and line_ratio(body.points[stay]) > _SPREAD:
+    if ids and spans_plane(body.points[stay]):
         notes.append(f"left out of all frames: target {', '.join(map(str, ids))} ({recurring.statement})")
         return ids
     return ()
 
 
-def _eliminate(
-    body: Body, pose: IntArray, row: IntArray, table: PairTable, judged: PairDeviations, left_out: tuple[int, ...]
-) -> tuple[NDArray[np.bool_], list[RejectedPose], list[RejectedPoint]]:
-    """Points that stay, poses rejected, points rejected."""
-    keep = ~np.isin(body.ids[row], left_out)
-    poses: list[RejectedPose] = []
-    points: list[RejectedPoint] = []
-    violated: dict[int, list[int]] = {}
-    for k in np.flatnonzero(~judged.accepted):
-        violated.setdefault(int(table.pose[k]), []).append(int(k))
-    order = np.argsort(table.pose, kind="stable")
-    bounds: Mapping[int, IntArray] = _groups(table.pose, order)
-    by_pose = _groups(pose, np.argsort(pose, kind="stable"))
-    for q, rows in by_pose.items():
-        rows = rows[keep[rows]]
-        if q in violated:
-            local = {int(r): i for i, r in enumerate(rows)}
-            badness = np.zeros((len(rows), len(rows)))
-            for k in bounds[q]:
-                i, j = local.get(int(table.first[k])), local.get(int(table.second[k]))
-                if i is not None and j is not None:
-                    size = (judged.measured[k] - judged.expected[k]) / judged.sigma[k]
-                    badness[i, j] = badness[j, i] = size**2
-            bad = [
-                (local[int(table.first[k])], local[int(table.second[k])])
-                for k in violated[q]
-                if int(table.first[k]) in local and int(table.second[k]) in local
-            ]
-            gone = culprits(len(rows), bad, badness)
-            if gone is None:
-                keep[rows] = False
-                worst = max(violated[q], key=lambda k: abs(judged.measured[k] - judged.expected[k]) / judged.sigma[k])
-                off = 1e3 * (judged.measured[worst] - judged.expected[worst])
-                poses.append(
-                    RejectedPose(
-                        q,
-                        f"lengths contradict the body and fewer than three targets would remain "
-                        f"(targets {judged.first[worst]} and {judged.second[worst]}: {off:+.3f} mm)",
-                    )
-                )
-                continue
-            for i in gone:
-                keep[rows[i]] = False
-                points.append(RejectedPoint(q, int(body.ids[row[rows[i]]]), "its distances to other targets are off"))
-            rows = rows[keep[rows]]
-        if len(rows) < 3 or line_ratio(body.points[row[rows]]) < _SPREAD:
-            keep[rows] = False
-            text = "fewer than three targets measured" if len(rows) < 3 else "the targets measured lie in one line"
-            poses.append(RejectedPose(q, text))
-    return keep, poses, points
+def _fit(points: MeasuredPoints, used: _BodyPoints, body: Body, sigma: float | None) -> tuple[FrameFit, float | None]:
+    """Fitted frames; a noise that was estimated from lengths is estimated again from the fits."""
+    station = None if points.station_jacobian is None else points.station_jacobian[used.at]
+    fit = fit_frames(used.pose, used.row, used.p_world, used.covariance, body, station, points.station_covariance)
+    if sigma is None or fit.redundancy.sum() < 30:
+        return fit, sigma
+    # lengths gave a robust first value; the accepted fits give the efficient one
+    scale = float(np.sqrt(fit.chi2.sum() / fit.redundancy.sum()))
+    return replace(fit, covariance=fit.covariance * scale**2, chi2=fit.chi2 / scale**2), sigma * scale
 
 
-def _groups(keys: IntArray, order: IntArray) -> dict[int, IntArray]:
-    if len(keys) == 0:
-        return {}
-    cuts = np.flatnonzero(np.diff(keys[order])) + 1
-    return {int(keys[g[0]]): g for g in np.split(order, cuts)}
+def _faults_of_fits(fit: FrameFit, factor: float, notes: list[str]) -> list[RejectedPose | None]:
+    """Fits not to be trusted; misfits in many poses are evidence, named in ``notes`` and not rejected."""
+    faults = [_fault_of_fit(fit, i, factor) for i in range(len(fit.pose))]
+    misfits = sum(fault is not None and fault.fault is PoseFault.MISFIT for fault in faults)
+    if misfits <= TOO_MANY * len(faults):
+        return faults
+    notes.append(f"in {misfits} of {len(faults)} poses the body does not fit: evidence, not rejected")
+    return [None if fault is None or fault.fault is PoseFault.MISFIT else fault for fault in faults]
 
 
-def _bad_fit(chi2: float, redundancy: int, covariance: Array, factor: float) -> str | None:
+def _fault_of_fit(fit: FrameFit, i: int, factor: float) -> RejectedPose | None:
     """Why a fit is not to be trusted although its lengths are (a mirrored or wrongly numbered body)."""
+    pose, chi2, redundancy, covariance = int(fit.pose[i]), fit.chi2[i], int(fit.redundancy[i]), fit.covariance[i]
     if not np.isfinite(covariance).all() or np.sqrt(np.trace(covariance[3:, 3:])) > 0.2:
-        return "the targets measured do not determine the orientation of the body (or their sigmas are too large)"
+        text = "the targets measured do not determine the orientation of the body (or their sigmas are too large)"
+        return RejectedPose(pose, PoseFault.UNDETERMINED, text)
     if redundancy > 0 and stats.chi2.sf(chi2 / max(factor, 1.0) ** 2, redundancy) < 1e-12:
-        return f"{_MISFIT} (chi-square {chi2:.0f} with {redundancy}): mirrored or misnumbered targets"
+        return RejectedPose(
+            pose,
+            PoseFault.MISFIT,
+            f"lengths agree but the body does not fit (chi-square {chi2:.0f} with {redundancy}): "
+            "mirrored or misnumbered targets",
+        )
     return None
 
 
-def _assemble(points: MeasuredPoints, fit: FrameFit, good: NDArray[np.bool_], method: str) -> dict[str, Any]:
-    """Frames from points and frames by resection, in the order of the poses."""
-    pose, T, C, common = fit.pose[good], fit.world_T_body[good], fit.covariance[good], fit.common_covariance[good]
-    methods = [method] * int(good.sum())
+@dataclass(frozen=True)
+class _Frames(FrameFit):
+    """Fitted and resected frames in the order of their poses."""
+
+    method: tuple[FrameMethod, ...]
+
+
+def _with_resected(points: MeasuredPoints, fit: FrameFit, good: NDArray[np.bool_], method: FrameMethod) -> _Frames:
+    """Good fits, and frames by resection in the poses without one."""
+    columns: list[Any] = [fit.pose, fit.world_T_body, fit.covariance, fit.common_covariance, fit.chi2, fit.redundancy]
+    columns = [column[good] for column in columns]
+    methods: list[FrameMethod] = [method] * int(good.sum())
     targets = [t for t, g in zip(fit.targets, good, strict=True) if g]
-    chi2, redundancy = fit.chi2[good], fit.redundancy[good]
     r = points.resected
     if r is not None:
-        new = ~np.isin(r.pose, pose)
-        pose = np.concatenate([pose, r.pose[new]])
-        T = np.concatenate([T, r.world_T_body[new]])
-        C, common = np.concatenate([C, r.covariance[new]]), np.concatenate([common, r.common_covariance[new]])
-        methods += ["resection"] * int(new.sum())
-        targets += [t for t, n in zip(r.targets, new, strict=True) if n]
-        chi2 = np.concatenate([chi2, np.full(new.sum(), np.nan)])
-        redundancy = np.concatenate([redundancy, np.zeros(new.sum(), dtype=np.int64)])
-    order = np.argsort(pose, kind="stable")
-    return {
-        "pose": pose[order],
-        "world_T_body": T[order],
-        "covariance": C[order],
-        "common_covariance": common[order],
-        "method": tuple(methods[i] for i in order),
-        "targets": tuple(targets[i] for i in order),
-        "chi2": chi2[order],
-        "redundancy": redundancy[order],
-    }
+        new = ~np.isin(r.pose, columns[0])
+        n = int(new.sum())
+        resected = [r.pose, r.world_T_body, r.covariance, r.common_covariance]
+        more = [*(column[new] for column in resected), np.full(n, np.nan), np.zeros(n, dtype=np.int64)]
+        columns = [np.concatenate(pair) for pair in zip(columns, more, strict=True)]
+        methods += ["resection"] * n
+        targets += [t for t, chosen in zip(r.targets, new, strict=True) if chosen]
+    order = np.argsort(columns[0], kind="stable")
+    pose, T, C, common, chi2, redundancy = (column[order] for column in columns)
+    return _Frames(
+        pose, T, C, common, tuple(targets[i] for i in order), chi2, redundancy, tuple(methods[i] for i in order)
+    )
+
+
+def _without_frame(
+    points: MeasuredPoints, with_frame: IntArray, rejected: list[RejectedPose]
+) -> tuple[RejectedPose, ...]:
+    """Every pose without a frame, also those of which no point of the body was left."""
+    have = set(with_frame.tolist())
+    out = [r for r in rejected if r.pose not in have]
+    reason_of: dict[int, str] = {}
+    for point in points.rejected:
+        reason_of.setdefault(point.pose, point.reason)
+    for q in sorted({*points.pose.tolist(), *reason_of} - have - {r.pose for r in out}):
+        because = f" ({reason_of[q]})" if q in reason_of else ""
+        out.append(RejectedPose(q, PoseFault.FEW_TARGETS, f"fewer than three targets measured{because}"))
+    return tuple(out)

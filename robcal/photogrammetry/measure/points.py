@@ -3,25 +3,45 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
 from robcal.errors import DegenerateGeometry
-from robcal.photogrammetry.core.bodies import Body, IntArray, line_ratio
+from robcal.photogrammetry.core.bodies import Body, IntArray, spans_plane
 from robcal.photogrammetry.core.camera import project
 from robcal.photogrammetry.core.eccentric_circle import effective_point
-from robcal.photogrammetry.core.grouping import sum_by
 from robcal.photogrammetry.measure.measured_points import MeasuredPoints, RejectedPoint, ResectedPoses
-from robcal.photogrammetry.orientation.intersection import intersect
-from robcal.photogrammetry.orientation.resection import PoseFit, Resection, refine_poses, resect_images
-from robcal.photogrammetry.station.adjustment import interior_basis, linearise
-from robcal.photogrammetry.station.network import MarkTable, StationMarks, StationOrientation, Unknowns
+from robcal.photogrammetry.measure.resected_poses import resect_poses
+from robcal.photogrammetry.orientation.intersection import Intersection, intersect
+from robcal.photogrammetry.station.network import MarkTable, StationMarks, StationOrientation
 from robcal.transforms import Array, invert, skew, transform
 
-_SPREAD = 0.02
-"""Targets whose spread across their line is below this share do not carry a frame."""
+
+@dataclass(frozen=True)
+class _Points:
+    """Columns of :class:`MeasuredPoints`, m rows."""
+
+    pose: IntArray
+    target: IntArray
+    p_world: Array
+    covariance: Array
+    n_cameras: IntArray
+    residual: Array
+    jacobian: Array
+
+    @property
+    def columns(self) -> tuple[Any, ...]:
+        return (self.pose, self.target, self.p_world, self.covariance, self.n_cameras, self.residual, self.jacobian)
+
+    def select(self, rows: ArrayLike) -> _Points:
+        return _Points(*(column[np.asarray(rows)] for column in self.columns))
+
+    def joined(self, other: _Points) -> _Points:
+        return _Points(*(np.concatenate(pair) for pair in zip(self.columns, other.columns, strict=True)))
 
 
 def measure_points(
@@ -46,84 +66,29 @@ def measure_points(
     Points with the covariance of the marks, and the derivative by the station's parameters with their covariance.
     """
     carried = orientation.body if body is None else body
-    table, number, noise = _table(orientation, marks, carried)
-    rejected: list[RejectedPoint] = []
-    suspect = {r.pose for r in orientation.rejected if r.kind == "contradiction"}
+    table, number = _table(orientation, marks, carried)
     if len(table.camera) == 0:
         raise DegenerateGeometry("the cameras of the station have no usable marks")
-    poses, pose_row = np.unique(number, return_inverse=True)
-    world_T_body = _known_poses(orientation, poses)
-    xy = _centred(orientation, table, pose_row, world_T_body, carried)
-    key = pose_row * (len(carried) + 1) + table.target
-    point = np.unique(key, return_inverse=True)[1]
-    rays = np.bincount(point)
-    several = rays[point] >= 2
-    sub_keys, sub_point = np.unique(key[several], return_inverse=True)
-    e, c = len(orientation.world_T_exterior), len(orientation.names)
-    width = 6 * e + 9 * c
-    empty = np.empty((0, 3))
-    pose_of, target_of, p, C, n_cam, res, J = (
-        np.empty(0, dtype=np.int64),
-        np.empty(0, dtype=np.int64),
-        empty,
-        np.empty((0, 3, 3)),
-        np.empty(0, dtype=np.int64),
-        np.empty(0),
-        np.empty((0, 3, width)),
-    )
-    inconsistent: tuple[int, ...] = ()
-    if len(sub_keys):
-        covariance = table.covariance[several] * noise[several][:, None, None]
-        out = intersect(
-            sub_point,
-            table.camera[several],
-            xy[several],
-            covariance,
-            orientation.cameras,
-            orientation.world_T_exterior,
-            exterior=table.exterior[several],
-            critical=critical,
-        )
-        pose_of = poses[sub_keys // (len(carried) + 1)]
-        target_of = carried.ids[sub_keys % (len(carried) + 1)]
-        keep, inconsistent = _consistent(
-            out.chi2, out.n_cameras, out.p_world, pose_of, target_of, critical, rejected, suspect
-        )
-        redundancy = 2 * out.n_cameras - 3
-        res = np.sqrt(np.maximum(out.chi2, 0) / np.maximum(redundancy, 1))[keep]
-        J = np.concatenate(
-            [
-                np.moveaxis(out.by_exterior, 1, 2).reshape(len(out.p_world), 3, 6 * e),
-                np.moveaxis(out.by_interior, 1, 2).reshape(len(out.p_world), 3, 9 * c),
-            ],
-            axis=-1,
-        )[keep]
-        pose_of, target_of, p = pose_of[keep], target_of[keep], out.p_world[keep]
-        C, n_cam = out.covariance[keep], out.n_cameras[keep]
+    suspect = {r.pose for r in orientation.rejected if r.kind == "contradiction"}
+    points, inconsistent, rejected = _intersected(orientation, table, number, carried, critical, suspect)
     resected = None
     if resection:
-        weak = _weak_poses(poses, pose_of, target_of, carried)
-        weak = np.array([q for q in weak if q not in suspect], dtype=np.int64)
-        resected = _resect_poses(orientation, table, number, noise, weak, carried, rejected)
-    if resected is not None and len(resected.pose):
-        drop = np.isin(pose_of, resected.pose)
-        extra = _points_of_resection(resected, carried)
-        zero = np.zeros((len(extra[0]), 3, width))
-        pose_of = np.concatenate([pose_of[~drop], extra[0]])
-        target_of = np.concatenate([target_of[~drop], extra[1]])
-        p, C = np.concatenate([p[~drop], extra[2]]), np.concatenate([C[~drop], extra[3]])
-        n_cam = np.concatenate([n_cam[~drop], extra[4]])
-        res = np.concatenate([res[~drop], np.full(len(extra[0]), np.nan)])
-        J = np.concatenate([J[~drop], zero])
-    order = np.lexsort((carried.index(target_of), pose_of))
+        weak = _weak_poses(np.unique(number), points, carried)
+        weak = weak[~np.isin(weak, list(suspect))]
+        resected, failed = resect_poses(orientation, table, number, weak, carried)
+        rejected += failed
+    if resected is not None:
+        points = points.select(~np.isin(points.pose, resected.pose))
+        points = points.joined(_points_of_resection(resected, carried, points.jacobian.shape[-1]))
+    points = points.select(np.lexsort((carried.index(points.target), points.pose)))
     return MeasuredPoints(
-        pose_of[order],
-        target_of[order],
-        p[order],
-        C[order],
-        n_cam[order],
-        res[order],
-        J[order],
+        points.pose,
+        points.target,
+        points.p_world,
+        points.covariance,
+        points.n_cameras,
+        points.residual,
+        points.jacobian,
         orientation.covariance,
         resected,
         tuple(rejected),
@@ -131,10 +96,43 @@ def measure_points(
     )
 
 
+def _intersected(
+    orientation: StationOrientation, table: MarkTable, number: IntArray, body: Body, critical: float, suspect: set[int]
+) -> tuple[_Points, tuple[int, ...], list[RejectedPoint]]:
+    """Points that two or more cameras see: those consistent, poses in which most are not, points rejected."""
+    poses, pose_row = np.unique(number, return_inverse=True)
+    xy = _centred(orientation, table, pose_row, _known_poses(orientation, poses), body)
+    key = pose_row * (len(body) + 1) + table.target
+    point = np.unique(key, return_inverse=True)[1]
+    several = np.bincount(point)[point] >= 2
+    keys, point = np.unique(key[several], return_inverse=True)
+    if len(keys) == 0:
+        width, none = 6 * len(orientation.world_T_exterior) + 9 * len(orientation.names), np.empty(0, dtype=np.int64)
+        empty = np.empty((0, 3, 3))
+        return _Points(none, none, empty[:, 0], empty, none, np.empty(0), np.empty((0, 3, width))), (), []
+    out = intersect(
+        point,
+        table.camera[several],
+        xy[several],
+        table.covariance[several],
+        orientation.cameras,
+        orientation.world_T_exterior,
+        exterior=table.exterior[several],
+        critical=critical,
+    )
+    pose, target = poses[keys // (len(body) + 1)], body.ids[keys % (len(body) + 1)]
+    keep, inconsistent, rejected = _consistent(out, pose, target, critical, suspect)
+    by_station = [np.moveaxis(J, 1, 2).reshape(len(keys), 3, -1) for J in (out.by_exterior, out.by_interior)]
+    residual = np.sqrt(np.maximum(out.chi2, 0) / np.maximum(2 * out.n_cameras - 3, 1))
+    J = np.concatenate(by_station, axis=-1)
+    points = _Points(pose, target, out.p_world, out.covariance, out.n_cameras, residual, J)
+    return points.select(keep), inconsistent, rejected
+
+
 def _table(
     orientation: StationOrientation, marks: Mapping[str, StationMarks], body: Body
-) -> tuple[MarkTable, IntArray, Array]:
-    """All marks not left out by the orientation: table (pose unused), pose numbers, variance factor per mark."""
+) -> tuple[MarkTable, IntArray]:
+    """Marks not left out by the orientation, covariances scaled by its noise factors, and their pose numbers."""
     banned = {(r.camera, r.pose, r.target) for r in orientation.rejected if r.kind == "outlier"}
     radius, normals = 0.5 * body.diameters, body.estimated_normals()
     columns: list[tuple[np.ndarray, ...]] = []
@@ -154,16 +152,15 @@ def _table(
                 m.pose[keep],
                 target[keep],
                 m.xy[keep],
-                m.covariance[keep],
-                np.full(n, orientation.noise[name] ** 2),
+                m.covariance[keep] * orientation.noise[name] ** 2,
             )
         )
     if not columns:
         raise DegenerateGeometry("none of the cameras of the orientation has marks")
-    camera, exterior, number, target, xy, covariance, noise = (np.concatenate(v) for v in zip(*columns, strict=True))
+    camera, exterior, number, target, xy, covariance = (np.concatenate(v) for v in zip(*columns, strict=True))
     zeros = np.zeros(len(camera), dtype=np.int64)
     table = MarkTable(camera, exterior, zeros, target, xy, covariance, radius[target], normals[target])
-    return table, number, noise
+    return table, number
 
 
 def _known_poses(orientation: StationOrientation, poses: IntArray) -> Array:
@@ -196,207 +193,54 @@ def _centred(
 
 
 def _consistent(
-    chi2: Array,
-    n_cameras: IntArray,
-    p: Array,
-    pose: IntArray,
-    target: IntArray,
-    critical: float,
-    rejected: list[RejectedPoint],
-    suspect: set[int],
-) -> tuple[NDArray[np.bool_], tuple[int, ...]]:
-    """Points whose rays agree. Where most points of a pose fail it is not the points: they stay, the pose is named;
-    but in a ``suspect`` pose, whose images the orientation found to contradict one another, they go."""
-    level = 2 * stats.norm.sf(critical)
-    finite = np.asarray(np.isfinite(p).all(axis=1))
-    limit = stats.chi2.isf(level, np.maximum(2 * n_cameras - 3, 1))
-    fails = finite & (chi2 > limit)
+    out: Intersection, pose: IntArray, target: IntArray, critical: float, suspect: set[int]
+) -> tuple[NDArray[np.bool_], tuple[int, ...], list[RejectedPoint]]:
+    """Points whose rays agree, poses in which most do not, and points rejected.
+
+    Where most points of a pose fail it is not the points: they stay, the pose is named; but in a ``suspect`` pose,
+    whose images the orientation found to contradict one another, they go.
+    """
+    redundancy = np.maximum(2 * out.n_cameras - 3, 1)
+    finite = np.asarray(np.isfinite(out.p_world).all(axis=1))
+    fails = finite & (out.chi2 > stats.chi2.isf(2 * stats.norm.sf(critical), redundancy))
     inconsistent = []
     for q in np.unique(pose[fails]):
         rows = pose == q
         if fails[rows].sum() > 0.5 * rows.sum() and rows.sum() >= 3 and int(q) not in suspect:
             inconsistent.append(int(q))
             fails[rows] = False
+    rejected = []
     for i in np.flatnonzero(fails | ~finite):
-        reason = (
-            f"the rays miss one another by {np.sqrt(chi2[i] / max(1, 2 * n_cameras[i] - 3)):.1f} standard deviations"
-            if finite[i]
-            else "the rays are nearly parallel"
+        apart = np.sqrt(out.chi2[i] / redundancy[i])
+        reason = f"the rays miss one another by {apart:.1f} standard deviations"
+        rejected.append(
+            RejectedPoint(int(pose[i]), int(target[i]), reason if finite[i] else "the rays are nearly parallel")
         )
-        rejected.append(RejectedPoint(int(pose[i]), int(target[i]), reason))
-    return finite & ~fails, tuple(inconsistent)
+    return finite & ~fails, tuple(inconsistent), rejected
 
 
-def _weak_poses(poses: IntArray, pose_of: IntArray, target_of: IntArray, body: Body) -> IntArray:
+def _weak_poses(poses: IntArray, points: _Points, body: Body) -> IntArray:
     """Poses with fewer than three intersected targets of known coordinates, or with all of them in one line."""
     weak = []
-    known = body.known
-    at = body.index(target_of)
+    at = body.index(points.target)
     for q in poses:
-        rows = at[pose_of == q]
-        rows = rows[known[rows]]
-        if len(rows) < 3 or line_ratio(body.points[rows]) < _SPREAD:
+        rows = at[points.pose == q]
+        rows = rows[body.known[rows]]
+        if not spans_plane(body.points[rows]):
             weak.append(q)
     return np.array(weak, dtype=np.int64)
 
 
-def _resect_poses(
-    orientation: StationOrientation,
-    table: MarkTable,
-    number: IntArray,
-    noise: Array,
-    wanted: IntArray,
-    body: Body,
-    rejected: list[RejectedPoint],
-) -> ResectedPoses | None:
-    use = np.isin(number, wanted) & body.known[table.target]
-    if not use.any():
-        return None
-    rows = np.flatnonzero(use)
-    scaled = table.covariance * noise[:, None, None]
-    starts: list[tuple[int, Array]] = []
-    for c, camera in enumerate(orientation.cameras):
-        mine = rows[table.camera[rows] == c]
-        if len(mine) == 0:
-            continue
-        seen, image = np.unique(number[mine], return_inverse=True)
-        fits = resect_images(
-            camera, image.astype(np.int64), body.ids[table.target[mine]], table.xy[mine], scaled[mine], body
-        )
-        for q, fit in zip(seen, fits, strict=True):
-            if isinstance(fit, Resection):
-                e = orientation.exterior_of(c, [q])[0]
-                for T in (fit.camera_T_body, fit.alternative):
-                    if T is not None:
-                        starts.append((int(q), orientation.world_T_exterior[e] @ T))
-            else:
-                rejected.append(RejectedPoint(int(q), -1, f"camera {orientation.names[c]}: {fit}"))
-    if not starts:
-        return None
-    best_fit, which, tile = _fit_all(orientation, table, scaled, number, rows, starts, body)
-    own = np.array([q for q, _ in starts])
-    chosen: list[int] = []
-    for q in np.unique(own):
-        candidates = np.flatnonzero(own == q)
-        candidates = candidates[np.argsort(best_fit.cost[candidates])]
-        best = candidates[0]
-        redundancy = int(best_fit.redundancy[best])
-        variance = max(1.0, best_fit.cost[best] / max(1, redundancy))
-        distinct = [
-            k
-            for k in candidates[1:]
-            if np.trace(best_fit.reference_T_body[k][:3, :3].T @ best_fit.reference_T_body[best][:3, :3]) < 3 - 1e-4
-        ]
-        if redundancy <= 0:
-            rejected.append(RejectedPoint(int(q), -1, "resection: three marks alone cannot be verified"))
-        elif stats.chi2.sf(best_fit.cost[best], redundancy) < 1e-9:
-            rejected.append(RejectedPoint(int(q), -1, "resection: the marks do not fit the body"))
-        elif distinct and best_fit.cost[distinct[0]] < best_fit.cost[best] + 14 * variance:
-            rejected.append(
-                RejectedPoint(int(q), -1, "resection: a plane seen by one camera, two poses fit equally well")
-            )
-        elif not np.isfinite(best_fit.covariance[best]).all():
-            rejected.append(RejectedPoint(int(q), -1, "resection: the pose is not determined"))
-        else:
-            chosen.append(int(best))
-    if not chosen:
-        return None
-    common = _common_covariance(orientation, table, scaled, best_fit.reference_T_body, which, tile, body)
-    seen_by = [np.unique(table.camera[tile[which == k]]) for k in chosen]
-    return ResectedPoses(
-        own[chosen],
-        best_fit.reference_T_body[chosen],
-        best_fit.covariance[chosen],
-        common[chosen],
-        np.array([len(s) for s in seen_by], dtype=np.int64),
-        tuple(tuple(sorted({int(i) for i in body.ids[table.target[tile[which == k]]]})) for k in chosen),
-    )
-
-
-def _fit_all(
-    orientation: StationOrientation,
-    table: MarkTable,
-    scaled: Array,
-    number: IntArray,
-    rows: IntArray,
-    starts: list[tuple[int, Array]],
-    body: Body,
-) -> tuple[PoseFit, IntArray, IntArray]:
-    """Refine all start poses with the marks of all cameras: fit, start number and table row of each mark used."""
-    tiles = [rows[number[rows] == q] for q, _ in starts]
-    tile = np.concatenate(tiles)
-    which = np.repeat(np.arange(len(starts)), [len(t) for t in tiles])
-    fit = refine_poses(
-        np.array([T for _, T in starts]),
-        which,
-        table.exterior[tile],
-        [orientation.cameras[c] for c in orientation.exterior_camera],
-        orientation.world_T_exterior,
-        body.points[table.target[tile]],
-        table.xy[tile],
-        scaled[tile],
-        radius=table.radius[tile],
-        normals=table.normals[tile],
-        iterations=25,
-    )
-    return fit, which, tile
-
-
-def _common_covariance(
-    orientation: StationOrientation,
-    table: MarkTable,
-    scaled: Array,
-    poses: Array,
-    which: IntArray,
-    tile: IntArray,
-    body: Body,
-) -> Array:
-    """(k, 6, 6) what the uncertainty of station and body adds to resected poses."""
-    marks = MarkTable(
-        table.camera[tile],
-        table.exterior[tile],
-        which,
-        table.target[tile],
-        table.xy[tile],
-        scaled[tile],
-        table.radius[tile],
-        table.normals[tile],
-    )
-    interior = np.array([camera.vector for camera in orientation.cameras])
-    unknowns = Unknowns(interior, orientation.world_T_exterior, poses, np.nan_to_num(body.points))
-    ones = np.ones(len(orientation.names))
-    lin = linearise(marks, unknowns, orientation.cameras, ones)
-    k, e, c, t = len(poses), len(orientation.world_T_exterior), len(orientation.names), len(body)
-    B = np.nan_to_num(lin.by_pose)
-    N = sum_by(which, np.swapaxes(B, -1, -2) @ B, k)
-    pull = np.swapaxes(B, -1, -2)
-    by_numbers = np.nan_to_num(lin.by_interior) @ np.linalg.inv(interior_basis(interior))[marks.camera]
-    pinv = np.linalg.pinv(N, hermitian=True)
-
-    def gathered(owner: IntArray, count: int, blocks: Array) -> Array:
-        """(k, 6, count * width) sums of pull @ blocks, one column block per owner."""
-        width = blocks.shape[-1]
-        total = sum_by(which * count + owner, pull @ np.nan_to_num(blocks), k * count)
-        return np.moveaxis(total.reshape(k, count, 6, width), 1, 2).reshape(k, 6, count * width)
-
-    K = -pinv @ np.concatenate(
-        [gathered(marks.exterior, e, lin.by_exterior), gathered(marks.camera, c, by_numbers)], axis=-1
-    )
-    out = K @ orientation.covariance @ np.swapaxes(K, -1, -2)
-    if body.covariance is not None:
-        L = -pinv @ gathered(marks.target, t, lin.by_point)
-        out = out + L @ np.nan_to_num(body.covariance) @ np.swapaxes(L, -1, -2)
-    return out
-
-
-def _points_of_resection(resected: ResectedPoses, body: Body) -> tuple[IntArray, IntArray, Array, Array, IntArray]:
-    """Points of resected bodies: pose, target, p_world, covariance from the pose's, n_cameras (all marked 1)."""
-    pose = np.repeat(resected.pose, [len(t) for t in resected.targets])
-    row = np.repeat(np.arange(len(resected.pose)), [len(t) for t in resected.targets])
+def _points_of_resection(resected: ResectedPoses, body: Body, width: int) -> _Points:
+    """Points of resected bodies: covariance from the pose's, n_cameras 1, no derivative by the station."""
+    counts = [len(t) for t in resected.targets]
+    pose, row = np.repeat(resected.pose, counts), np.repeat(np.arange(len(resected.pose)), counts)
     target = np.array([i for t in resected.targets for i in t], dtype=np.int64)
     X = body.points[body.index(target)]
     T = resected.world_T_body[row]
     R = T[:, :3, :3]
     J = np.concatenate([R, -R @ skew(X)], axis=-1)
     covariance = J @ resected.covariance[row] @ np.swapaxes(J, -1, -2)
-    return pose, target, transform(T, X), covariance, np.ones(len(pose), dtype=np.int64)
+    m = len(pose)
+    ones, unknown = np.ones(m, dtype=np.int64), np.full(m, np.nan)
+    return _Points(pose, target, transform(T, X), covariance, ones, unknown, np.zeros((m, 3, width)))

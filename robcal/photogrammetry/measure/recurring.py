@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from robcal.photogrammetry.core.bodies import Body, IntArray, line_ratio
+from robcal.photogrammetry.core.bodies import Body, IntArray, spans_plane
 from robcal.photogrammetry.measure.distance_criterion import PairTable, body_pair_variance, culprits
 from robcal.transforms import Array, fit_frame, invert, transform
 
@@ -75,7 +75,7 @@ def mean_shape(
     t = len(points)
     order = np.argsort(pose, kind="stable")
     groups = [g for g in np.split(order, np.flatnonzero(np.diff(pose[order])) + 1) if len(g)]
-    usable = [g for g in groups if len(g) >= 3 and line_ratio(points[row[g]]) > 0.02]
+    usable = [g for g in groups if spans_plane(points[row[g]])]
     mean, sigma, count = np.full((t, 3), np.nan), np.full((t, 3), np.nan), np.zeros(t, dtype=np.int64)
     if not usable:
         return mean, sigma, count
@@ -189,7 +189,7 @@ def _off_the_plane(body: Body, mean: Array, sigma: Array, stay: IntArray, scale:
         sizes, worst, which = [], 0.0, -1
         for i in stay:
             others = stay[stay != i]
-            if line_ratio(body.points[others]) < 0.02:
+            if not spans_plane(body.points[others]):
                 continue
             moved = transform(fit_frame(body.points[others], mean[others] / scale), mean[i] / scale)
             C = np.diag(sigma[i] ** 2 + np.mean(sigma[others] ** 2, axis=0)) + 2 * body.marginal(i) + shared * np.eye(3)
@@ -220,7 +220,7 @@ def _common_scale(deviation: Array, length: Array, sigma: Array) -> tuple[float,
 def _shifts(
     body: Body, mean: Array, sigma: Array, stay: IntArray, removed: list[int], scale: float
 ) -> tuple[TargetShift, ...]:
-    if len(stay) < 3 or line_ratio(body.points[stay]) < 0.02:
+    if not spans_plane(body.points[stay]):
         return ()
     body_T_mean = fit_frame(body.points[stay], mean[stay] / scale)
     moved = transform(body_T_mean, mean / scale)

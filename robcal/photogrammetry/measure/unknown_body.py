@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robcal.errors import DegenerateGeometry
-from robcal.photogrammetry.core.bodies import Body, IntArray, line_ratio
+from robcal.photogrammetry.core.bodies import Body, IntArray, spans_plane
 from robcal.photogrammetry.measure.measured_points import MeasuredPoints
 from robcal.transforms import Array, fit_frame, gram_schmidt_frame, invert, transform
 
@@ -50,7 +50,7 @@ def body_from_points(points: MeasuredPoints, use: NDArray[np.bool_], ids: IntArr
         moved = []
         for k in range(len(poses)):
             both = seen[k] & np.isfinite(shape).all(axis=1)
-            if both.sum() >= 3 and line_ratio(shape[both]) > 0.02:
+            if spans_plane(shape[both]):
                 moved.append(transform(invert(fit_frame(p[k, both], shape[both])), p[k]))
         stack = np.array(moved)
         known = np.isfinite(stack).all(axis=2).any(axis=0)
@@ -68,7 +68,7 @@ def _triangle(p: Array, seen: NDArray[np.bool_]) -> list[int]:
         if not rows.any():
             continue
         q = p[rows][:, list(chosen)]
-        if line_ratio(q[0]) < 0.02:
+        if not spans_plane(q[0]):
             continue
         area = float(np.median(np.linalg.norm(np.cross(q[:, 1] - q[:, 0], q[:, 2] - q[:, 0]), axis=1)))
         key = (int(rows.sum()), area)

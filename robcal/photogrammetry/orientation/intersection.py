@@ -14,9 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robcal.errors import InvalidInput
+from robcal.estimation.batched import NormalEquations, minimise_each
+from robcal.estimation.grouping import members, sum_by, whitener
+from robcal.estimation.summary import TerminationSettings
 from robcal.photogrammetry.core.bodies import IntArray
 from robcal.photogrammetry.core.camera import Camera, normalise, project_with_jacobians
-from robcal.photogrammetry.core.grouping import sum_by, whitener
 from robcal.transforms import Array, invert, skew, transform
 
 
@@ -56,7 +58,7 @@ def intersect(
     *,
     exterior: IntArray | None = None,
     critical: float = 4.0,
-    iterations: int = 6,
+    iterations: int = 8,
 ) -> Intersection:
     """Intersect the rays of each point; with three or more rays one that contradicts the others is left out.
 
@@ -107,19 +109,21 @@ def intersect(
             np.where(ok, W @ d_in, 0.0),
         )
 
-    def solve(x: Array, loops: int) -> Array:
-        for _ in range(loops):
-            r, J, _, _ = linearise(x)
-            N = sum_by(point, np.swapaxes(J, -1, -2) @ J, n)
-            g = sum_by(point, np.einsum("mij,mi->mj", J, r), n)
-            step = np.zeros_like(x)
-            step[regular] = np.linalg.solve(_regular(N[regular]), g[regular][..., None])[..., 0]
-            x = x + step
-            if np.nanmax(np.abs(step), initial=0.0) < 1e-10:
-                break
-        return x
+    def equations(x: Array, chosen: IntArray) -> NormalEquations:
+        rows, place = members(point, at[chosen], n)
+        rows, place = rows[used[rows]], place[used[rows]]
+        R, centre = T[rows, :3, :3], T[rows, :3, 3]
+        p_camera = np.einsum("mji,mj->mi", R, x[place] - centre)
+        predicted, d_point = np.empty((len(rows), 2)), np.empty((len(rows), 2, 3))
+        for c, cam in enumerate(cameras):
+            own = camera[rows] == c
+            predicted[own], d_point[own], _ = project_with_jacobians(cam, p_camera[own])
+        r = np.einsum("mij,mj->mi", W[rows], xy[rows] - predicted)
+        return NormalEquations.of_rows(place, r, W[rows] @ d_point @ np.swapaxes(R, -1, -2), len(chosen))
 
-    p = solve(p, iterations)
+    at = np.flatnonzero(regular)
+    settings = TerminationSettings(iterations, negligible=1e-10)
+    p[at] = minimise_each(equations, np.add, p[at], settings).state
     while count.max(initial=0) >= 3:
         # redundancy-normalised residual per ray; drop the worst one of each point that has three or more
         r, J, _, _ = linearise(p)
@@ -133,7 +137,7 @@ def intersect(
             break
         used = used & ~drop
         count = np.bincount(point[used], minlength=n).astype(np.int64)
-        p = solve(p, iterations)
+        p[at] = minimise_each(equations, np.add, p[at], settings).state
     r, J, d_ext, d_in = linearise(p)
     Q = _inverse(sum_by(point, np.swapaxes(J, -1, -2) @ J, n), regular)
     # implicit derivative: dp = -Q J' (J_station) d station

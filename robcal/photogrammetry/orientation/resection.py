@@ -15,10 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robcal.errors import DegenerateGeometry, InvalidInput
+from robcal.estimation.batched import NormalEquations, minimise_each
+from robcal.estimation.grouping import members, whitener
+from robcal.estimation.summary import TerminationSettings
 from robcal.photogrammetry.core.bodies import Body, IntArray, line_ratio, thickness_ratio
 from robcal.photogrammetry.core.camera import Camera, normalise, project, project_with_jacobians
 from robcal.photogrammetry.core.eccentric_circle import effective_point
-from robcal.photogrammetry.core.grouping import sum_by, whitener
 from robcal.photogrammetry.orientation.p3p import three_point_poses
 from robcal.transforms import Array, frame, invert, retract, skew, transform
 
@@ -93,69 +95,45 @@ def refine_poses(
     points : (m, 3) m body coordinates of each mark's target; xy (m, 2) px, covariance (m, 2, 2) px^2.
     radius, normals : (m,), (m, 3) of circular targets, for the eccentricity of their images.
     """
-    T = np.array(reference_T_body, dtype=float)
-    k = len(T)
+    k = len(reference_T_body)
     W = whitener(covariance)
     camera_T_reference = invert(reference_T_camera)
-    count = np.bincount(pose, minlength=k).astype(np.int64)
 
-    def residuals(poses: Array) -> tuple[Array, Array]:
-        camera_T_body = (camera_T_reference[camera] @ poses[pose]) if len(pose) else np.empty((0, 4, 4))
-        p_camera = transform(camera_T_body, points)
+    def camera_points(poses: Array, rows: IntArray, place: IntArray) -> tuple[Array, Array]:
+        camera_T_body = (camera_T_reference[camera[rows]] @ poses[place]) if len(rows) else np.empty((0, 4, 4))
+        p_camera = transform(camera_T_body, points[rows])
         if radius is not None and normals is not None:
-            turned = np.einsum("mij,mj->mi", camera_T_body[:, :3, :3], normals)
-            p_camera = effective_point(p_camera, turned, radius)
-        r = np.empty((len(pose), 2))
-        J = np.empty((len(pose), 2, 6))
-        R = camera_T_body[:, :3, :3]
-        by_pose = np.concatenate([R, -R @ skew(points)], axis=-1)
+            turned = np.einsum("mij,mj->mi", camera_T_body[:, :3, :3], normals[rows])
+            p_camera = effective_point(p_camera, turned, radius[rows])
+        return p_camera, camera_T_body[:, :3, :3]
+
+    def equations(poses: Array, chosen: IntArray) -> NormalEquations:
+        rows, place = members(pose, chosen, k)
+        p_camera, R = camera_points(poses, rows, place)
+        predicted, d_point = np.empty((len(rows), 2)), np.empty((len(rows), 2, 3))
         for c, cam in enumerate(cameras):
-            rows = camera == c
-            value, d_point, _ = project_with_jacobians(cam, p_camera[rows])
-            r[rows] = xy[rows] - value
-            J[rows] = d_point @ by_pose[rows]
-        return np.einsum("mij,mj->mi", W, r), W @ J
+            own = camera[rows] == c
+            predicted[own], d_point[own], _ = project_with_jacobians(cam, p_camera[own])
+        r = np.einsum("mij,mj->mi", W[rows], xy[rows] - predicted)
+        J = W[rows] @ d_point @ np.concatenate([R, -R @ skew(points[rows])], axis=-1)
+        return NormalEquations.of_rows(place, r, J, len(chosen))
 
-    def cost_of(r: Array) -> Array:
-        value = sum_by(pose, np.sum(r**2, axis=1), k)
-        return np.where(np.isfinite(value), value, np.inf)
+    settings = TerminationSettings(iterations, cost_tolerance=1e-8, negligible=1e-14)
+    found = minimise_each(equations, _turned_little, reference_T_body, settings)
+    p_camera, _ = camera_points(found.state, np.arange(len(pose)), pose)
+    predicted = np.empty((len(pose), 2))
+    for c, cam in enumerate(cameras):
+        predicted[camera == c] = project(cam, p_camera[camera == c])
+    count = np.bincount(pose, minlength=k).astype(np.int64)
+    C = found.equations.inverse()
+    C[count < 3] = np.nan
+    return PoseFit(found.state, C, found.equations.cost, count, np.einsum("mij,mj->mi", W, xy - predicted))
 
-    damping = np.full(k, 1e-6)
-    r, J = residuals(T)
-    cost = cost_of(r)
-    for _ in range(iterations):
-        clean = np.where(np.isfinite(J), J, 0.0)
-        N = sum_by(pose, np.swapaxes(clean, -1, -2) @ clean, k)
-        g = sum_by(pose, np.einsum("mij,mi->mj", clean, np.where(np.isfinite(r), r, 0.0)), k)
-        diagonal = np.einsum("kii->ki", N)
-        floor = 1e-12 * diagonal.max(axis=1, keepdims=True) + 1e-30
-        damped = N + (damping[:, None] * diagonal + floor)[:, :, None] * np.eye(6)
-        step = np.linalg.solve(damped, g[..., None])[..., 0]
-        length = np.linalg.norm(step[:, 3:], axis=1)
-        step *= np.minimum(1.0, 0.5 / np.maximum(length, 1e-300))[:, None]
-        trial = retract(T, step)
-        r_new, J_new = residuals(trial)
-        cost_new = cost_of(r_new)
-        better = cost_new <= cost
-        T = np.where(better[:, None, None], trial, T)
-        gain = np.where(better, cost - cost_new, np.inf)
-        damping = np.where(better, damping * 0.1, np.maximum(damping, 1e-4) * 10)
-        rows = better[pose]
-        r = np.where(rows[:, None], r_new, r)
-        J = np.where(rows[:, None, None], J_new, J)
-        cost = np.where(better, cost_new, cost)
-        if np.all((gain <= 1e-8 * (1e-6 + cost)) | (damping > 1e6)):
-            break
-    clean = np.where(np.isfinite(J), J, 0.0)
-    N = sum_by(pose, np.swapaxes(clean, -1, -2) @ clean, k)
-    scale = np.sqrt(np.maximum(np.einsum("kii->ki", N), 1e-300))
-    unit = N / (scale[:, :, None] * scale[:, None, :])
-    values = np.linalg.eigvalsh(unit)
-    regular = (values[:, 0] > 1e-12) & (count >= 3)
-    C = np.full((k, 6, 6), np.nan)
-    if regular.any():
-        C[regular] = np.linalg.inv(unit[regular]) / (scale[regular, :, None] * scale[regular, None, :])
-    return PoseFit(T, C, cost, count, r)
+
+def _turned_little(T: Array, step: Array) -> Array:
+    """Frames (k, 4, 4) moved by steps (k, 6), shortened so that none turns by more than half a radian."""
+    angle = np.linalg.norm(step[:, 3:], axis=1, keepdims=True)
+    return retract(T, step * np.minimum(1.0, 0.5 / np.maximum(angle, 1e-300)))
 
 
 def start_poses(camera: Camera, xy: Array, points: Array) -> list[Array]:

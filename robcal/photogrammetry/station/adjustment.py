@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from robcal.errors import NotIdentifiable
+from robcal.estimation.grouping import sum_by, whitener
 from robcal.photogrammetry.core.camera import INTRINSIC_NAMES, Camera, project_with_jacobians
 from robcal.photogrammetry.core.eccentric_circle import effective_point
-from robcal.photogrammetry.core.grouping import sum_by, whitener
 from robcal.photogrammetry.station.network import MarkTable, StationDesign, Unknowns
 from robcal.transforms import Array, invert, retract, skew
 

@@ -9,7 +9,8 @@ import numpy as np
 from scipy import stats
 
 from robcal.photogrammetry.station.adjustment import Adjusted, global_columns, interior_offset
-from robcal.photogrammetry.station.network import GROUPS, Evidence, RejectedMark, movement
+from robcal.photogrammetry.station.contradictions import CAMERA_MOVED, IMAGE_REJECTED, TARGET_SHIFTED
+from robcal.photogrammetry.station.network import GROUPS, RejectedMark, StationCause, movement
 from robcal.photogrammetry.station.scan import scan_moves, scan_targets
 from robcal.photogrammetry.station.state import StationState
 
@@ -26,7 +27,7 @@ class Cleaned:
     """Outcome of :func:`resolve_contradictions`."""
 
     adjusted: Adjusted
-    evidence: tuple[Evidence, ...]
+    evidence: tuple[StationCause, ...]
     rejected: tuple[RejectedMark, ...]
 
 
@@ -36,16 +37,16 @@ def resolve_contradictions(state: StationState, adjusted: Adjusted) -> Cleaned:
     Weakness: with two cameras a move is only seen as a relative one; it is booked on the camera that does not define
     the world. With fewer than six targets of which three are wrong the majority cannot be told.
     """
-    evidence: list[Evidence] = []
+    evidence: list[StationCause] = []
     rejected: list[RejectedMark] = []
     for _ in range(15):
         found = _strongest(state, adjusted)
         if found is None:
             break
-        if found.kind == "camera_moved" and found.pose is not None:
+        if found.kind.moves == "camera" and found.pose is not None:
             evidence.append(found)
             state.add_epoch(state.names.index(found.where), found.pose)
-        elif found.kind == "target_shifted":
+        elif found.kind.moves == "target":
             evidence.append(found)
             state.release_target(int(state.body.index([int(found.where)])[0]))
         else:
@@ -54,7 +55,7 @@ def resolve_contradictions(state: StationState, adjusted: Adjusted) -> Cleaned:
     return Cleaned(adjusted, tuple(evidence), tuple(rejected))
 
 
-def _drop_image(state: StationState, found: Evidence) -> list[RejectedMark]:
+def _drop_image(state: StationState, found: StationCause) -> list[RejectedMark]:
     """Leave out an image; of two images that contradict one another, both."""
     column = int(np.searchsorted(state.poses, -1 if found.pose is None else found.pose))
     of_pose = state.marks.pose == column
@@ -74,13 +75,13 @@ def _drop_image(state: StationState, found: Evidence) -> list[RejectedMark]:
     ]
 
 
-def _strongest(state: StationState, adjusted: Adjusted) -> Evidence | None:
-    candidates: list[Evidence] = []
+def _strongest(state: StationState, adjusted: Adjusted) -> StationCause | None:
+    candidates: list[StationCause] = []
     marks, design = state.marks, adjusted.design
     e, c, p = len(state.exterior_camera), len(state.names), len(state.poses)
     if c > 1 and state.settings.detect_moves:
         scan = scan_moves(design, marks, c, p, global_columns(marks, e, c))
-        for kind, table in (("camera_moved", scan.from_pose), ("image_rejected", scan.single)):
+        for kind, table in ((CAMERA_MOVED, scan.from_pose), (IMAGE_REJECTED, scan.single)):
             table = table.copy()
             fixed = state.exterior_camera[list(state.fixed)]
             table[fixed] *= 1.0 - 1e-3  # of two equal answers, the camera that does not define the world
@@ -90,13 +91,15 @@ def _strongest(state: StationState, adjusted: Adjusted) -> Evidence | None:
             estimate, covariance = scan.estimate_from[i, k], scan.covariance_from[i, k]
             text = (
                 movement(state.names[i], state.poses[k], estimate)
-                if kind == "camera_moved"
+                if kind == CAMERA_MOVED
                 else f"camera {state.names[i]} contradicts the others in pose {state.poses[k]} only"
             )
-            if kind == "camera_moved" and c == 2:
+            if kind == CAMERA_MOVED and c == 2:
                 text += "; with two cameras it may as well be the other one"
             candidates.append(
-                Evidence(kind, state.names[i], int(state.poses[k]), estimate, covariance, float(table[i, k]), 6, text)
+                StationCause(
+                    kind, state.names[i], None, int(state.poses[k]), estimate, covariance, float(table[i, k]), 6, text
+                )
             )
     if state.settings.detect_targets and state.prior.points_weight is not None:
         found = _worst_target(state, adjusted)
@@ -105,7 +108,7 @@ def _strongest(state: StationState, adjusted: Adjusted) -> Evidence | None:
     return max(candidates, key=lambda ev: ev.statistic, default=None)
 
 
-def _worst_target(state: StationState, adjusted: Adjusted) -> Evidence | None:
+def _worst_target(state: StationState, adjusted: Adjusted) -> StationCause | None:
     """The target whose given coordinates stand out from all others' (not merely a body of modest accuracy)."""
     seen = np.unique(state.marks.target)
     weight = state.prior.points_weight
@@ -124,8 +127,8 @@ def _worst_target(state: StationState, adjusted: Adjusted) -> Evidence | None:
     ident = int(state.body.ids[i])
     size = 1e3 * np.linalg.norm(scan.error[i])
     text = f"target {ident} of body {state.body.name} is {size:.3g} mm from where its file says"
-    return Evidence(
-        "target_shifted", str(ident), None, scan.error[i], scan.covariance[i], float(scan.statistic[i]), 3, text
+    return StationCause(
+        TARGET_SHIFTED, str(ident), None, None, scan.error[i], scan.covariance[i], float(scan.statistic[i]), 3, text
     )
 
 

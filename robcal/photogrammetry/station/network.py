@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from robcal.cause import Cause
 from robcal.errors import InvalidInput
 from robcal.photogrammetry.core.bodies import Body, IntArray
 from robcal.photogrammetry.core.camera import Camera
@@ -100,18 +101,15 @@ def movement(camera: str, pose: int, shift: Array) -> str:
 
 
 @dataclass(frozen=True)
-class Evidence:
+class StationCause(Cause):
     """Something in the data that contradicts the model again and again, with its test.
 
-    ``kind``: 'camera_moved', 'target_shifted', 'target_swapped' (``where``: both ids), 'lens_radial',
-    'lens_tangential', 'lens_affinity'; ``where``: camera or target; ``pose``: first
-    pose concerned or None; ``estimate`` and ``covariance`` in the units of the kind (shift m, turn rad in the camera's
-    or the body's coordinates); ``statistic`` chi-square with ``degrees`` of freedom; ``statement`` a sentence;
-    ``alone``: other data exclude that it was another camera.
+    `kind` is one of :mod:`robcal.photogrammetry.station.contradictions`; `where`: camera or target; `pose`: first pose
+    concerned or None; `estimate` and `covariance` in the units of the kind (shift m, turn rad in the camera's or the
+    body's coordinates); `statistic` chi-square with `degrees` of freedom; `statement` a sentence; `alone`: other data
+    exclude that it was another camera; `partner`: the other one of two swapped targets.
     """
 
-    kind: str
-    where: str
     pose: int | None
     estimate: Array
     covariance: Array
@@ -119,6 +117,7 @@ class Evidence:
     degrees: int
     statement: str
     alone: bool = False
+    partner: str = ""
 
 
 @dataclass(frozen=True)
@@ -254,7 +253,7 @@ class StationOrientation:
     redundancy_total: float
     rms_px: float
     rejected: tuple[RejectedMark, ...]
-    evidence: tuple[Evidence, ...]
+    evidence: tuple[StationCause, ...]
     free_interior: Mapping[str, tuple[str, ...]]
     converged: bool
     iterations: int

@@ -12,10 +12,11 @@ from robcal.photogrammetry.core.bodies import Body
 from robcal.photogrammetry.core.camera import Camera
 from robcal.photogrammetry.station.adjustment import Adjusted, covariance_blocks, interior_basis, interior_offset
 from robcal.photogrammetry.station.cleaning import drop_insignificant, resolve_contradictions, snoop
+from robcal.photogrammetry.station.contradictions import LENS_AFFINITY, LENS_RADIAL, LENS_TANGENTIAL, TARGET_SWAPPED
 from robcal.photogrammetry.station.network import (
     GROUPS,
-    Evidence,
     RejectedMark,
+    StationCause,
     StationMarks,
     StationOrientation,
     StationSettings,
@@ -78,7 +79,7 @@ def orient_station(
     if not images:
         reason = failed[0][2] if failed else "no marks"
         raise DegenerateGeometry(f"no image of the station carries a pose of body {body.name}: {reason}")
-    evidence: list[Evidence] = []
+    evidence: list[StationCause] = []
     swap = find_swap(marks, start, body, options.default_sigma_px, images)
     if swap is not None:
         evidence.append(_swap_evidence(body, *swap))
@@ -122,11 +123,13 @@ def _self_calibrated(
         return start
 
 
-def _swap_evidence(body: Body, i: int, j: int) -> Evidence:
+def _swap_evidence(body: Body, i: int, j: int) -> StationCause:
     a, b = int(body.ids[i]), int(body.ids[j])
-    text = f"targets {a} and {b} of body {body.name} are swapped: with exchanged coordinates the images fit"
+    text = TARGET_SWAPPED.describe(str(a), {"with": b})
     shift = body.points[j] - body.points[i]
-    return Evidence("target_swapped", f"{a},{b}", None, shift, np.zeros((3, 3)), float("inf"), 3, text)
+    return StationCause(
+        TARGET_SWAPPED, str(a), None, None, shift, np.zeros((3, 3)), float("inf"), 3, text, partner=str(b)
+    )
 
 
 def _left_out_by_resection(
@@ -172,16 +175,18 @@ def _usable(name: str, marks: StationMarks, body: Body) -> StationMarks:
     return StationMarks(marks.pose[keep], marks.target[keep], marks.xy[keep], marks.covariance[keep])
 
 
-def _lens_evidence(state: StationState, adjusted: Adjusted, given: Mapping[str, Camera | None]) -> tuple[Evidence, ...]:
+def _lens_evidence(
+    state: StationState, adjusted: Adjusted, given: Mapping[str, Camera | None]
+) -> tuple[StationCause, ...]:
     """Groups that are zero in a camera's file and yet significant in the images."""
-    out: list[Evidence] = []
+    out: list[StationCause] = []
     e = len(state.exterior_camera)
     offset = interior_offset(state.unknowns, state.prior)
-    families = {"radial": ("k1", "k2", "k3"), "tangential": ("tangential",), "affinity": ("affinity",)}
+    groups_of = {LENS_RADIAL: ("k1", "k2", "k3"), LENS_TANGENTIAL: ("tangential",), LENS_AFFINITY: ("affinity",)}
     for c, name in enumerate(state.names):
         if given.get(name) is None or state.settings.intrinsics == "fixed":
             continue
-        for family, groups in families.items():
+        for kind, groups in groups_of.items():
             found = [g for g in groups if g in state.groups[c]]
             if not found or any(g in state.kept[c] for g in groups):
                 continue
@@ -190,8 +195,8 @@ def _lens_evidence(state: StationState, adjusted: Adjusted, given: Mapping[str, 
             Q = adjusted.design.reduced_inverse[np.ix_(at, at)]
             d = offset[c, numbers]
             statistic = float(d @ np.linalg.solve(Q, d))
-            text = f"camera {name} has {family} distortion ({', '.join(found)}) that its file does not have"
-            out.append(Evidence(f"lens_{family}", name, None, d, Q, statistic, len(at), text))
+            text = f"camera {name} has {kind.words} ({', '.join(found)}) that its file does not have"
+            out.append(StationCause(kind, name, None, None, d, Q, statistic, len(at), text))
     return tuple(out)
 
 
@@ -199,7 +204,7 @@ def _result(
     state: StationState,
     adjusted: Adjusted,
     ambiguous: tuple[int, ...],
-    evidence: tuple[Evidence, ...],
+    evidence: tuple[StationCause, ...],
     rejected: tuple[RejectedMark, ...],
 ) -> StationOrientation:
     marks, design, x = state.marks, adjusted.design, state.unknowns

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from robcal.estimation.grouping import sum_by
 from robcal.photogrammetry.core.bodies import IntArray
-from robcal.photogrammetry.core.grouping import sum_by
 from robcal.photogrammetry.station.network import MarkTable, StationDesign
 from robcal.transforms import Array
 

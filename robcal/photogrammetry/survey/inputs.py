@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robcal.errors import InvalidInput, NotIdentifiable
-from robcal.photogrammetry.bundle.adjustment import AdjustSettings
 from robcal.photogrammetry.bundle.datum import DatumSpec
+from robcal.photogrammetry.bundle.settings import AdjustSettings
 from robcal.photogrammetry.core.camera import Camera
 from robcal.photogrammetry.core.network import IntArray, Lengths
 from robcal.photogrammetry.survey.images import Collection

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from robcal.imaging.detections import Detections
-from robcal.photogrammetry.bundle.adjustment import AdjustSettings
+from robcal.photogrammetry.bundle.settings import AdjustSettings
 from robcal.photogrammetry.core.camera import INTRINSIC_NAMES
 from robcal.photogrammetry.core.network import CameraNetwork, IntArray
 from robcal.transforms import Array

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from robcal.diagnosis.images.data import ImageData
 from robcal.diagnosis.images.light_lag import without_lag
 from robcal.photogrammetry.station.seen_normals import Ellipses
+from robcal.physics.images.data import ImageData
 from robcal.recipe.station import light_of
 from tests.diagnosis.image_scenes import Station, station
 
@@ -39,7 +39,7 @@ def _lagging(data: ImageData, name: str) -> ImageData:
 def test_lag_is_told_and_taken_back(scene: tuple[Station, dict[str, Ellipses], ImageData]) -> None:
     made, shapes, data = scene
     marks, found = without_lag(made.marks, shapes, lambda: _lagging(data, "left"))
-    assert [(f.cause, f.where) for f in found] == [("centroid_bias", "left")]
+    assert [(f.name, f.where) for f in found] == [("centroid_bias", "left")]
     lag, sigma = (np.array(table["by_light_px"]) for table in (found[0].parameters, found[0].sigma))
     assert np.all(np.abs(lag - LAG) < 4.0 * sigma)
     assert sigma.max() < 0.15

@@ -34,7 +34,7 @@ def _checked(network: CameraNetwork, ppm: float, seed: int, wrong: float = 0.0, 
 
 def test_a_wrong_scale_bar_shows_in_all_check_lengths(network: CameraNetwork) -> None:
     (found,) = scale_findings(_checked(network, 300.0, 1), "plate")
-    assert (found.cause, found.stage, found.where) == ("scale_error", "camera", "station")
+    assert (found.name, found.stage, found.where) == ("scale_error", "camera", "station")
     assert abs(found.parameters["ppm"] - 300.0) < 4.0 * found.sigma["ppm"]
     assert 0.0 < found.sigma["ppm"] < 60.0
     assert "too long" in found.statement

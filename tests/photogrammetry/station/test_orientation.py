@@ -58,7 +58,7 @@ def test_lens_is_found_from_poor_start_values(start):
     for camera, true in zip(o.cameras, s.cameras.values(), strict=True):
         assert abs(camera.fx - true.fx) < 2.0
         assert abs(camera.k1 - true.k1) < 5e-3
-    kinds = {e.kind for e in o.evidence}
+    kinds = {e.name for e in o.evidence}
     # a lens term is a finding only where a camera file lacks it
     assert kinds == ({"lens_radial", "lens_tangential"} if start == "rough" else set())
 
@@ -85,7 +85,7 @@ def test_shifted_target_is_named_and_costs_no_marks():
     points[2] += [0.001, 0.0, 0.0]
     s.body = replace(s.body, points=points)
     o = _orient(s)
-    shifts = [e for e in o.evidence if e.kind == "target_shifted"]
+    shifts = [e for e in o.evidence if e.name == "target_shifted"]
     assert [e.where for e in shifts] == ["33"]
     assert np.allclose(shifts[0].estimate, [-0.001, 0, 0], atol=1e-4)
     assert len(o.rejected) <= 2
@@ -98,7 +98,9 @@ def test_swapped_targets_of_the_body_file():
     points[[1, 2]] = points[[2, 1]]
     s.body = replace(s.body, points=points)
     o = _orient(s)
-    assert [(e.kind, e.where) for e in o.evidence if not e.kind.startswith("lens")] == [("target_swapped", "22,33")]
+    assert [(e.name, e.where, e.partner) for e in o.evidence if not e.name.startswith("lens")] == [
+        ("target_swapped", "22", "33")
+    ]
     assert o.sigma0 < 1.2
 
 
@@ -108,7 +110,7 @@ def test_camera_that_moved(cameras):
     m = s.marks["right"]
     s.change("right", xy=m.xy + np.where(m.pose >= 25, 1.0, 0.0)[:, None] * [0.6, 0.4])
     o = _orient(s)
-    moved = [e for e in o.evidence if e.kind == "camera_moved"]
+    moved = [e for e in o.evidence if e.name == "camera_moved"]
     assert [(e.where, e.pose) for e in moved] == [("right", 25)]
     assert o.sigma0 < 1.3
     assert len(o.rejected) < 5
@@ -120,7 +122,7 @@ def test_one_wrong_image_is_left_out():
     s.change("right", xy=m.xy + np.where(m.pose == 7, 1.0, 0.0)[:, None] * [30.0, 10.0])
     o = _orient(s)
     assert {r.pose for r in o.rejected} == {7}
-    assert not [e for e in o.evidence if e.kind == "camera_moved"]
+    assert not [e for e in o.evidence if e.name == "camera_moved"]
     assert o.sigma0 < 1.1
 
 

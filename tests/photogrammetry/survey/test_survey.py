@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from robcal.errors import DegenerateGeometry, InvalidInput, NotIdentifiable
-from robcal.photogrammetry.bundle.adjustment import AdjustSettings
 from robcal.photogrammetry.bundle.body_frame import fit_similarity
+from robcal.photogrammetry.bundle.settings import AdjustSettings
 from robcal.photogrammetry.core.camera import Camera
 from robcal.photogrammetry.core.network import CameraNetwork, Lengths
 from robcal.photogrammetry.survey.survey import BodyTarget, SurveyImage, SurveyResult, SurveySettings, survey_body

@@ -9,14 +9,21 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from robcal.diagnosis.images.cause import ImageCause, only
-from robcal.diagnosis.images.data import ImageData
-from robcal.diagnosis.images.refraction import refraction_causes
 from robcal.photogrammetry.core.camera import project_with_jacobians
 from robcal.photogrammetry.core.eccentricity import centre_shift
-from robcal.physics.cause import Array
+from robcal.photogrammetry.station.contradictions import (
+    CAMERA_MOVED,
+    LENS_AFFINITY,
+    LENS_RADIAL,
+    LENS_TANGENTIAL,
+    TARGET_SHIFTED,
+)
+from robcal.physics.cause import DEG, Array, Constants
+from robcal.physics.images.cause import CENTROID_BIAS, ECCENTRICITY, UNKNOWN_FIELD, ImageCause, only
+from robcal.physics.images.data import ImageData
+from robcal.physics.images.refraction import refraction_causes
+from robcal.physics.measuring import BODY_THERMAL_GROWTH, SCALE_DRIFT
 
-DEG = float(np.degrees(1.0))
 FIELD_DEGREE = 5
 MOST_CHANGE_POINTS = 40
 LEAST_LIGHT = 0.02
@@ -48,37 +55,31 @@ def _lens(data: ImageData, c: int, name: str, rows: Array) -> Iterator[ImageCaus
     labels = {4: "k1", 5: "k2", 8: "k3"}
     if len(radial) == 3:
         yield ImageCause(
-            "lens_radial",
-            "camera",
+            LENS_RADIAL,
             name,
             None,
             only(rows, by[:, :, radial]),
             np.array([0.1, 0.1, 0.1]),
-            lambda v: {labels[i]: float(x) for i, x in zip(radial, v, strict=True)},
-            "The lens of camera {where} has radial distortion that its file leaves out",
+            lambda v, c: {labels[i]: float(x) for i, x in zip(radial, v, strict=True)},
         )
     if not {"p1", "p2"} & free:
         yield ImageCause(
-            "lens_tangential",
-            "camera",
+            LENS_TANGENTIAL,
             name,
             None,
             only(rows, by[:, :, 6:8]),
             np.array([1e-3, 1e-3]),
-            lambda v: {"p1": float(v[0]), "p2": float(v[1])},
-            "The lens of camera {where} has tangential distortion that its file leaves out",
+            lambda v, c: {"p1": float(v[0]), "p2": float(v[1])},
         )
     if not ({"affinity"} & free or ({"fx", "fy"} <= free - {"f_only"} and "f_only" not in free)):
         f = data.cameras[c].fy
         yield ImageCause(
-            "lens_affinity",
-            "camera",
+            LENS_AFFINITY,
             name,
             None,
             only(rows, by[:, :, 1:2]),
             np.array([1e-3 * f]),
-            lambda v: {"fy_minus_fx_px": float(v[0])},
-            "The pixels of camera {where} are not square: fy differs from fx by {fy_minus_fx_px:.2f} px",
+            lambda v, c: {"fy_minus_fx_px": float(v[0])},
         )
 
 
@@ -101,14 +102,12 @@ def _eccentricity(data: ImageData) -> Iterator[ImageCause]:
     if not names:
         return
     yield ImageCause(
-        "ellipse_eccentricity",
-        "image",
+        ECCENTRICITY,
         names[0] if len(names) == 1 else "station",
         None,
         shift[:, :, None] / radius**2,
         np.array([1e-4]),
-        lambda v: {"diameter_mm": 2e3 * float(np.sqrt(max(v[0], 0.0)))},
-        "Dots seen obliquely by {where} show off their centres as dots of {diameter_mm:.1f} mm do",
+        lambda v, c: {"diameter_mm": 2e3 * float(np.sqrt(max(v[0], 0.0)))},
         bends=True,
         plausible=lambda v: float(v[0]) > 0,
         places=names,
@@ -125,13 +124,12 @@ def _bias(data: ImageData, name: str, rows: Array) -> Iterator[ImageCause]:
     if not data.dots or not np.any(np.isfinite(tilt[rows])):
         return
     yield ImageCause(
-        "centroid_bias",
-        "image",
+        CENTROID_BIAS,
         name,
         None,
         only(rows, np.nan_to_num(tilt)[:, :, None]),
         np.array([0.1]),
-        lambda v: {"px": float(v[0])},
+        lambda v, c: {"px": float(v[0])},
         "Centres of tilted dots in {where} are displaced along their tilt, by {px:.3f} px at a right angle",
         weight=0.3,
         bends=True,
@@ -150,13 +148,12 @@ def _lag(data: ImageData, name: str, rows: Array) -> Iterator[ImageCause]:
         return
     columns = np.nan_to_num(data.light)[:, None, None] * np.eye(2)
     yield ImageCause(
-        "centroid_bias",
-        "image",
+        CENTROID_BIAS,
         name,
         None,
         only(rows, columns),
         np.array([0.2, 0.2]),
-        lambda v: {"px": float(np.hypot(*v)), "by_light_px": [float(x) for x in v]},
+        lambda v, c: {"px": float(np.hypot(*v)), "by_light_px": [float(x) for x in v]},
         "Centres of bright dots in {where} lag behind their light, by {px:.3f} px where a dot is as bright as can be",
         weight=0.3,
         bends=True,
@@ -174,7 +171,7 @@ def _field(data: ImageData, c: int, name: str, rows: Array) -> ImageCause:
     columns[:, 0, : len(powers)] = monomials
     columns[:, 1, len(powers) :] = monomials
 
-    def report(v: Array) -> dict[str, object]:
+    def report(v: Array, c: Constants) -> dict[str, object]:
         terms = [
             f"{axis} += {value:.4g} x^{i} y^{j}"
             for axis, part in (("dx", v[: len(powers)]), ("dy", v[len(powers) :]))
@@ -184,14 +181,12 @@ def _field(data: ImageData, c: int, name: str, rows: Array) -> ImageCause:
         return {"term": {"variables": ["x_px", "y_px"], "kind": "formula", "formula": "; ".join(terms)}}
 
     return ImageCause(
-        "unknown",
-        "camera",
+        UNKNOWN_FIELD,
         name,
         None,
         only(rows, columns),
         np.full(columns.shape[2], 0.1),
         report,
-        "The images of {where} are bent in a manner that no lens model of the library describes",
         weight=0.1,
         least_gain=0.15,
     )
@@ -224,18 +219,16 @@ def move_cause(data: ImageData, by: Array, name: str, rows: Array, pose: int, we
     """A camera that stands elsewhere from an image on."""
     label = data.image_names[pose]
     return ImageCause(
-        "camera_moved",
-        "camera",
+        CAMERA_MOVED,
         name,
         None,
         only(rows & (data.image >= pose), by),
         np.array([2e-4, 2e-4, 2e-4, 1e-4, 1e-4, 1e-4]),
-        lambda v: {
+        lambda v, c: {
             "pose": label,
             "shift_mm": [1e3 * float(x) for x in v[:3]],
             "turn_deg": [DEG * float(x) for x in v[3:]],
         },
-        "Camera {where} moved before pose {pose}",
         weight=weight,
         pose=pose,
         once=False,
@@ -246,14 +239,12 @@ def _targets(data: ImageData, by_target: Array) -> Iterator[ImageCause]:
     present = np.unique(data.target)
     for target in present:
         yield ImageCause(
-            "target_shifted",
-            "body",
+            TARGET_SHIFTED,
             str(int(target)),
             None,
             only(data.target == target, by_target),
             np.array([1e-4, 1e-4, 1e-4]),
-            lambda v: {"shift_mm": [1e3 * float(x) for x in v]},
-            "Target {where} sits at another place than its file says, by {shift_mm} mm",
+            lambda v, c: {"shift_mm": [1e3 * float(x) for x in v]},
             weight=1.0 / len(present),
         )
 
@@ -263,29 +254,31 @@ def _growth(data: ImageData, by_target: Array) -> Iterator[ImageCause]:
     radial = by_target @ data.p_body[:, :, None]
     warm = {name: v for name, v in data.covariates.items() if name.startswith("temp_") and np.ptp(v) > 0}
     for name, change in warm.items():
+
+        def report(v: Array, c: Constants, name: str = name) -> dict[str, object]:
+            return {"um_per_m_K": 1e6 * float(v[0]), "covariate": name}
+
         yield ImageCause(
-            "body_thermal_growth",
-            "body",
+            BODY_THERMAL_GROWTH,
             data.body,
             None,
             radial * change[:, None, None],
             np.array([1e-5]),
-            lambda v, name=name: {"um_per_m_K": 1e6 * float(v[0]), "covariate": name},  # type: ignore[misc]
+            report,
             "Body {where} grows by {um_per_m_K:.1f} um per metre and kelvin of {covariate}",
             weight=0.5 / len(warm),
-            twins=(("scale_drift", "station"),),
+            twins=((SCALE_DRIFT, "station"),),
         )
     hours = data.covariates.get("hours")
     if hours is not None and np.ptp(hours) > 0:
         yield ImageCause(
-            "scale_drift",
-            "camera",
+            SCALE_DRIFT,
             "station",
             None,
             radial * hours[:, None, None],
             np.array([50e-6 / float(np.max(np.abs(hours)))]),
-            lambda v: {"ppm_per_h": 1e6 * float(v[0])},
+            lambda v, c: {"ppm_per_h": 1e6 * float(v[0])},
             "The scale of the station drifts by {ppm_per_h:.1f} ppm an hour",
             weight=0.25,
-            twins=(("body_thermal_growth", data.body),),
+            twins=((BODY_THERMAL_GROWTH, data.body),),
         )

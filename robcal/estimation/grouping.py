@@ -6,12 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from robcal.transforms import Array
+Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
 
 _SMALL = 20_000
 
 
-def sum_by(group: NDArray[np.int64], values: Array, n: int) -> Array:
+def sum_by(group: IntArray, values: Array, n: int) -> Array:
     """Sums of ``values`` (m, ...) over equal numbers in ``group`` (m,), shape (n, ...)."""
     m = len(group)
     if m == 0:
@@ -23,6 +24,16 @@ def sum_by(group: NDArray[np.int64], values: Array, n: int) -> Array:
         return (chooser @ values.reshape(m, -1)).reshape(n, *values.shape[1:])
     adder = sparse.csr_matrix((np.ones(m), (group, np.arange(m))), shape=(n, m))
     return np.asarray(adder @ values.reshape(m, -1)).reshape(n, *values.shape[1:])
+
+
+def members(group: IntArray, chosen: IntArray, n: int) -> tuple[IntArray, IntArray]:
+    """Rows (k,) of ``group`` (m,) that belong to the ``chosen`` groups of n, and their places (k,) in ``chosen``."""
+    if len(chosen) == n:
+        return np.arange(len(group)), group
+    place = np.full(n, -1, dtype=np.int64)
+    place[chosen] = np.arange(len(chosen))
+    rows = np.flatnonzero(place[group] >= 0)
+    return rows, place[group[rows]]
 
 
 def whitener(covariance: Array) -> Array:

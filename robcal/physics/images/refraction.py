@@ -6,10 +6,11 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from robcal.diagnosis.images.cause import ImageCause, only
-from robcal.diagnosis.images.data import ImageData
 from robcal.photogrammetry.core.camera import project_with_jacobians
 from robcal.physics.cause import Array
+from robcal.physics.images.cause import ImageCause, only
+from robcal.physics.images.data import ImageData
+from robcal.physics.refraction import REFRACTION
 
 GLASS = 1.52
 TILTS = (0.0, 0.3, 0.6)
@@ -33,13 +34,12 @@ def refraction_causes(data: ImageData, c: int, name: str, rows: Array) -> Iterat
     for normal in normals:
         shift = -normal * _window_shift(data.p_camera, normal)[:, None]
         yield ImageCause(
-            "refraction",
-            "camera",
+            REFRACTION,
             name,
             None,
             only(rows, by_point @ shift[:, :, None]),
             np.array([1e-2]),
-            lambda v: {"index": GLASS, "thickness_mm": 1e3 * float(v[0])},
+            lambda v, c: {"index": GLASS, "thickness_mm": 1e3 * float(v[0])},
             "Camera {where} looks through a window that acts like {thickness_mm:.1f} mm of glass",
             weight=0.5 / len(normals),
             bends=True,
@@ -53,13 +53,12 @@ def refraction_causes(data: ImageData, c: int, name: str, rows: Array) -> Iterat
         depth = np.einsum("mi,mi->m", direction, data.p_camera)
         depth = depth - np.mean(depth[rows])
         yield ImageCause(
-            "refraction",
-            "camera",
+            REFRACTION,
             name,
             None,
             only(rows, -by_point @ (direction * depth[:, None])[:, :, None]),
             np.array([0.2]),
-            lambda v: {"index": float(1.0 / max(1.0 - v[0], 1e-3))},
+            lambda v, c: {"index": float(1.0 / max(1.0 - v[0], 1e-3))},
             "Camera {where} looks through a boundary of media (apparent index {index:.3f})",
             weight=0.25 / len(directions),
             bends=True,
