@@ -21,7 +21,7 @@ from robcal.robot.model import GEOMETRIC_KINDS
 
 MUCH_WORSE = 1.25
 """Factor by which the error in one fold may grow."""
-CLEAR, CLEAR_SIGMAS = 0.8, 3.0
+CLEAR, CLEAR_SIGMAS = 0.9, 3.0
 """Factor to which the error has to fall, and standard errors, for a fault of the measuring to be beyond doubt."""
 WAITING = 1.01
 """Factor by which the error may grow where terms wait for approach directions that the user may state."""
