@@ -13,12 +13,13 @@ from pipeline.camera_file import CameraFile, read_camera
 from pipeline.camera_import import split_choice
 from pipeline.campaign_schema import FORMAT, CampaignEntry, StationCameraEntry, SurveyEntry
 from pipeline.images import list_images
-from pipeline.measurement_tables import MarksTable, MeasuredTable, read_marks, read_measurements
+from pipeline.measurement_tables import MarksTable, MeasuredTable, read_marks, read_measurements, without_frozen
 from pipeline.poses_table import Poses, read_poses
 from pipeline.robot_import import read_any_robot
 from pipeline.schemas import parse, proposal
 from pipeline.yaml_io import YamlDocument, read_yaml
 from robcal.errors import InvalidInput
+from robcal.robot.chain import chain_of, forward
 from robcal.robot.model import RobotModel
 
 
@@ -157,6 +158,9 @@ class _Reader:
         measurements = tuple(
             read_measurements(self._file(name), poses.names if poses else ()) for name in entry.measurements
         )
+        if robot is not None and poses is not None:
+            places = forward(chain_of(robot), poses.q)[:, :3, 3]
+            measurements = tuple(without_frozen(table, places, poses.names) for table in measurements)
         for table in measurements:
             self.warnings.extend(table.notes)
             self._check_targets(table, bodies)

@@ -6,7 +6,7 @@ The kind of a table is told by its columns. Everything is converted to metres an
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from pipeline.frame_tables import SIX, frame_covariance_columns, twist_from_six
 from pipeline.tables import Table, read_table
+from robcal.calibration.slips import empty_readings, frozen_readings
 from robcal.errors import InvalidInput
 from robcal.transforms import Array, frame_from_xyzrpy
 
@@ -35,6 +36,7 @@ class MeasuredTable:
     values : (m, 3) points in m, (m, 4, 4) frames, or (m,) distances in m.
     covariance : (m, 3, 3), (m, 6, 6) (right perturbation of the frame) or (m,) variances; None if not stated.
     covariates : further numeric columns that belong to the single measurement (``cycle``, ``time_s``).
+    angles : (m, 3) of frames as they stand in the file, rad.
     """
 
     kind: Kind
@@ -46,9 +48,27 @@ class MeasuredTable:
     covariance: Array | None
     covariates: Mapping[str, Array]
     notes: tuple[str, ...] = ()
+    angles: Array | None = None
 
     def __len__(self) -> int:
         return len(self.pose)
+
+    def without(self, rows: NDArray[np.bool_], note: str) -> MeasuredTable:
+        """The table without some rows, and why."""
+        if not rows.any():
+            return self
+        kept = ~rows
+        return replace(
+            self,
+            pose=self.pose[kept],
+            rows=self.rows[kept],
+            target=self.target[kept],
+            values=self.values[kept],
+            covariance=None if self.covariance is None else self.covariance[kept],
+            covariates={name: values[kept] for name, values in self.covariates.items()},
+            notes=(*self.notes, note),
+            angles=None if self.angles is None else self.angles[kept],
+        )
 
 
 @dataclass(frozen=True)
@@ -101,7 +121,47 @@ def read_measurements(path: Path, pose_names: Sequence[str], kind: Kind | None =
         covariance = _point_covariance(table)
     _check_size(table, values)
     covariates = {name: table.numbers(name) for name in ("cycle", "time_s") if table.has(name)}
-    return MeasuredTable(kind, path, pose, table.rows, target, values, covariance, covariates, tuple(notes))
+    angles = six[:, 3:] if kind == "frames" else None
+    measured = MeasuredTable(kind, path, pose, table.rows, target, values, covariance, covariates, tuple(notes), angles)
+    return _without_empty(measured, pose_names)
+
+
+def _without_empty(table: MeasuredTable, pose_names: Sequence[str]) -> MeasuredTable:
+    """Without rows of zeros or sentinels, which programs write where they measured nothing.
+
+    Raises
+    ------
+    InvalidInput : no row holds a reading.
+    """
+    if table.kind == "distances":
+        return table
+    numbers = 1e3 * (table.values[:, :3, 3] if table.kind == "frames" else table.values)
+    empty = empty_readings(np.round(numbers, 6))
+    if empty.all():
+        raise InvalidInput(f"{table.path}: no row holds a reading: all coordinates are zero or a sentinel")
+    told = _few(list(dict.fromkeys(pose_names[i] for i in table.pose[empty])))
+    return table.without(
+        empty, f"{table.path.name}: {int(empty.sum())} rows hold no reading (zeros or a sentinel), set aside: {told}"
+    )
+
+
+def without_frozen(table: MeasuredTable, places: Array, pose_names: Sequence[str]) -> MeasuredTable:
+    """Without readings that stand still while the nominal flange moves on; ``places`` (n, 3) at the poses, m."""
+    frozen = np.zeros(len(table), dtype=bool)
+    if table.kind == "sensor_points":
+        return table
+    values = table.values[:, :3].reshape(len(table), -1) if table.kind == "frames" else table.values
+    for target in np.unique(table.target):
+        rows = np.flatnonzero(table.target == target)
+        frozen[rows] = frozen_readings(table.pose[rows], values[rows].reshape(len(rows), -1), places)
+    if frozen.all():
+        return table
+    told = _few(list(dict.fromkeys(pose_names[i] for i in table.pose[frozen])))
+    return table.without(
+        frozen,
+        f"{table.path.name}: {int(frozen.sum())} readings repeat the one before though the robot had moved: set aside "
+        f"({told})",
+    )
 
 
 def _kind(table: Table) -> Kind:

@@ -19,6 +19,8 @@ from robcal.transforms import Array
 
 LIMIT_SLACK = 1e-3
 """Poses may lie this much (rad or m) beyond a limit: controllers round."""
+LONGEST_STEP = 3600.0
+"""Time (s) from one pose to the next that no recording takes as a rule."""
 NO_PAYLOAD = frozenset({"", "none", "-", "0"})
 
 
@@ -184,6 +186,8 @@ def _covariates(table: Table, known: set[str], notes: list[str]) -> dict[str, Ar
             continue
         if name == "time_s" or re.fullmatch(r"temp_\w+_c", name):
             covariates[name] = table.numbers(name)
+            if name == "time_s":
+                notes.extend(_doubtful_times(table.path.name, covariates[name]))
             continue
         values = table.number_column(name)
         if values is None:
@@ -191,3 +195,18 @@ def _covariates(table: Table, known: set[str], notes: list[str]) -> dict[str, Ar
         else:
             covariates[name] = values
     return covariates
+
+
+def _doubtful_times(file: str, time_s: Array) -> list[str]:
+    """What speaks against the column ``time_s``: milliseconds, or a clock that runs back."""
+    steps = np.diff(time_s)
+    notes = []
+    if len(steps) and float(np.median(steps)) > LONGEST_STEP:
+        usual = float(np.median(steps))
+        notes.append(
+            f"column 'time_s' of {file}: {usual:.0f} s from one pose to the next: these look like milliseconds "
+            f"({usual / 1000:.0f} s then): divide by 1000"
+        )
+    if (steps < 0).any():
+        notes.append(f"column 'time_s' of {file} runs back at row {int(np.argmax(steps < 0)) + 3}: check the clock")
+    return notes

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from pipeline import codec
+from pipeline.artifacts import DETECTED, detections
 from pipeline.body_file import BodyFile
 from pipeline.campaign import Campaign, ImageSource
 from pipeline.campaign_schema import SurveyEntry
@@ -145,13 +146,13 @@ def work(context: Context) -> Outcome:
             content = run.hash(path)
             _refuse_duplicate(hashes.setdefault(source, {}), content, path)
             key = fingerprint(content, codec.encode(settings, {}), version)[:32]
-            jobs.append(_Job(source, name, path, str(run.detections(key)), key, settings))
+            jobs.append(_Job(source, name, path, str(run.artifact(detections(key))), key, settings))
     results = in_processes(_detect, jobs, context.workers)
     entries = list(track(results, len(jobs), "detecting targets"))
     _refuse_unreadable(entries)
     notes = [note for source, (images, _, _) in sources(campaign).items() for note in _check(source, images, entries)]
     index = DetectionIndex(tuple(entries))
-    path = run.save(NAME, index)
+    path = run.save(DETECTED, index)
     result = {
         "images": len(entries),
         "targets": sum(e.targets for e in entries),
@@ -199,7 +200,7 @@ def _check(source: str, images: ImageSource, entries: Sequence[ImageEntry]) -> l
 
 def load_detections(run: Run, index: DetectionIndex, source: str) -> dict[str, Detections]:
     """Image name -> targets of one source, images without targets left out."""
-    return {e.name: codec.load(run.detections(e.key)) for e in index.of(source) if e.key is not None and e.targets}
+    return {e.name: run.load(detections(e.key)) for e in index.of(source) if e.key is not None and e.targets}
 
 
 def sizes(index: DetectionIndex, source: str) -> tuple[int, int]:

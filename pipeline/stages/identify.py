@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.artifacts import CALIBRATED, IDENTIFICATION
 from pipeline.bodies import body_for_robot
 from pipeline.campaign import Campaign
 from pipeline.poses_table import Poses
@@ -19,7 +20,7 @@ from robcal.calibration.identification import IdentifiedRobot, IdentifyOptions
 from robcal.calibration.measurements import Rows
 from robcal.calibration.recording_faults import fault_of
 from robcal.errors import InvalidInput, RobcalError
-from robcal.recipe.identification import Identification, identify_robot
+from robcal.recipe.identification import identify_robot
 from robcal.robot.kernel import Kernel
 from robcal.robot.model import RobotModel
 
@@ -52,7 +53,7 @@ def work(context: Context) -> Outcome:
         found = identify_robot(robot, poses, recording, options_of(campaign, recording.stated))
     except InvalidInput as error:
         raise located(error, str(poses.path)) from None
-    outputs = [run.save(NAME, found)]
+    outputs = [run.save(IDENTIFICATION, found)]
     write_robot(run.robot, found.robot.model, f"calibrated from campaign {campaign.name}, before the diagnosis")
     notes = [*found.recording.notes, *_notes(found.robot, poses, found.rows)]
     return Outcome({"identification": _result(found.robot, found.rows)}, outputs, notes)
@@ -73,7 +74,7 @@ def check_joint_limits(campaign: Campaign, run: Run) -> None:
         kernel = Kernel(robot, campaign.entry.model.statics)
         try:
             recording = build_recording(campaign, run, body_for_robot(campaign, run))
-            fault = fault_of(robot, poses.inputs(kernel), recording, kernel)
+            fault = fault_of(robot, poses.inputs(kernel), recording)
         except RobcalError:
             fault = ""  # what else is wrong comes to light once the angles are within the ranges
     raise InvalidInput(poses.outside + (f"; a likely cause: {fault}" if fault else ""))
@@ -120,12 +121,6 @@ def _notes(found: IdentifiedRobot, poses: Poses, rows: Rows) -> list[str]:
     return notes
 
 
-def load_identification(run: Run) -> Identification:
-    """Result of the stage."""
-    found: Identification = run.load(NAME)
-    return found
-
-
 def load_calibrated(run: Run) -> CalibratedRobot:
     """The robot with all that was found out about it: after the diagnosis where there was one.
 
@@ -133,11 +128,12 @@ def load_calibrated(run: Run) -> CalibratedRobot:
     ------
     InvalidInput : the run has no calibrated robot.
     """
-    if run.record("diagnose") is not None and run.has("calibrated"):
-        found: CalibratedRobot = run.load("calibrated")
+    found = run.find(CALIBRATED)
+    if found is not None:
         return found
-    if run.record(NAME) is not None and run.has(NAME):
-        return load_identification(run).robot
+    identified = run.find(IDENTIFICATION)
+    if identified is not None:
+        return identified.robot
     raise InvalidInput(f"{run.folder}: holds no calibrated robot: the campaign needs a robot, poses and measurements")
 
 

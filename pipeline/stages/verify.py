@@ -7,23 +7,24 @@ from typing import Any
 
 import numpy as np
 
+from pipeline import artifacts
 from pipeline.codec import save_arrays
 from pipeline.poses_table import Poses
 from pipeline.robot_file import write_robot
 from pipeline.runs import Run
 from pipeline.stages.base import Context, Outcome, Stage, no_files
-from pipeline.stages.identify import load_calibrated, load_identification, options_of, require_robot
+from pipeline.stages.identify import load_calibrated, options_of, require_robot
 from pipeline.stages.survey import located
 from pipeline.tables import write_table
 from robcal.calibration.calibrated import CalibratedRobot
-from robcal.calibration.measurements import RobotObservations, RobotRecording, Rows
+from robcal.calibration.measurements import RobotObservations
 from robcal.calibration.observations import (
     DistanceObservations,
     FrameObservations,
     PointObservations,
     SensorPointObservations,
 )
-from robcal.calibration.verification import ErrorStatistics, Verification
+from robcal.calibration.verification import ErrorStatistics
 from robcal.errors import InvalidInput
 from robcal.recipe.verification import RobotVerification, datum_note, verify_robot
 from robcal.robot.model import parameter_unit
@@ -37,12 +38,12 @@ def work(context: Context) -> Outcome:
     """Verify on the kept-out poses, or by folds where there are none; write the calibrated robot."""
     campaign, run = context.campaign, context.run
     robot, poses = require_robot(campaign)
-    identification = load_identification(run)
+    identification = run.load(artifacts.IDENTIFICATION)
     calibrated = load_calibrated(run)
     diagnosed = run.record("diagnose") is not None
     # what the diagnosis found in the measuring system is no error of the robot
-    freed: RobotRecording | None = run.load("corrected") if diagnosed and run.has("corrected") else None
-    relative = run.load("relative") if diagnosed and run.has("relative") else None
+    freed = run.find(artifacts.CORRECTED) if diagnosed else None
+    relative = run.find(artifacts.RELATIVE_COVARIANCE) if diagnosed else None
     options = options_of(campaign, identification.recording.stated)
     try:
         found = verify_robot(robot, identification, calibrated, poses, options, freed, relative)
@@ -51,7 +52,12 @@ def work(context: Context) -> Outcome:
     write_robot(run.robot, calibrated.model, f"calibrated from campaign {campaign.name}")
     _write_covariance(run, calibrated)
     _write_residuals(run, poses, calibrated, identification.recording.observations)
-    outputs = [run.save(NAME, (found.delivered, found.rows)), run.robot, run.covariance, run.residuals]
+    outputs = [
+        run.save(artifacts.VERIFICATION, (found.delivered, found.rows)),
+        run.robot,
+        run.covariance,
+        run.residuals,
+    ]
     notes = [*found.notes, *_approach_note(found), *filter(None, [datum_note(identification, calibrated, poses)])]
     return Outcome({"verification": _result(found)}, outputs, notes)
 
@@ -136,12 +142,6 @@ def _result(found: RobotVerification) -> dict[str, Any]:
             "groups": outcome.iso.groups,
         }
     return result
-
-
-def load_verification(run: Run) -> tuple[Verification, Rows]:
-    """Result of the stage and the rows of the poses it was made on."""
-    found: tuple[Verification, Rows] = run.load(NAME)
-    return found
 
 
 STAGE = Stage(

@@ -52,9 +52,15 @@ class JointLog:
         return replace(self, approach=approach, inferred=())
 
     def stated(self) -> dict[str, Array]:
-        """All numeric columns (n,): covariates and approach directions."""
+        """All numeric columns (n,): covariates, approach directions, and each joint's last move (`moveK`, rad or m).
+
+        Moves follow from the order of the rows; they are zero where no approach is known, as for poses to predict
+        that state none.
+        """
         columns = {name: np.asarray(values, dtype=float) for name, values in self.covariates.items()}
         columns.update({f"approach{k + 1}": self.approach[:, k] for k in range(self.q.shape[1])})
+        moves = np.diff(self.q, axis=0, prepend=self.q[:1]) * bool(np.any(self.approach))
+        columns.update({f"move{k + 1}": moves[:, k] for k in range(self.q.shape[1])})
         return columns
 
     def recorded(self) -> dict[str, Array]:

@@ -119,10 +119,13 @@ class FrameObservations(_Rows):
     pose : row of the pose (m,).
     world_T_tool : (m, 4, 4).
     covariance : (m, 6, 6) of a right perturbation (m, rad).
+    stated_angles : (m, 3) the three angles as they stand in a file (rad), which may follow another convention than it
+        was read by; None where there is no file.
     """
 
     world_T_tool: Array
     covariance: Array
+    stated_angles: Array | None = None
     dimension: ClassVar[int] = 6
 
     def __post_init__(self) -> None:

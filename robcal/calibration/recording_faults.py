@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +10,8 @@ import numpy as np
 from robcal.calibration.identification import IdentifiedRobot
 from robcal.calibration.measurements import RobotRecording
 from robcal.calibration.observations import DistanceObservations, FrameObservations, PointObservations
-from robcal.calibration.plausibility import SUSPICIOUS_SHARE, likely_causes
+from robcal.calibration.slips import Slip, find_slips
+from robcal.calibration.slips.search import SUSPICIOUS_SHARE
 from robcal.errors import InvalidInput
 from robcal.robot.kernel import Kernel, PoseInputs
 from robcal.robot.model import RobotModel
@@ -17,30 +19,28 @@ from robcal.robot.model import RobotModel
 FAILED = 10.0
 """sigma0 of the stated uncertainty above which a fit counts as failed."""
 MOST_POSES = 300
+MOST_TOLD = 4
+"""Candidates that are listed where the data cannot tell which."""
 HOPELESS, HOPELESS_SHARE = 0.01, 0.02
 """Miss (m, and as a share of the way of the tool) of an identified robot above which it is no robot's."""
 
-_REMEDIES = {
-    "slipped_rows": "bring poses and measurements together again",
-    "exchanged_columns": "exchange the two columns",
-    "wrong_sign": "change 'sign' of this joint in the robot file",
-    "wrong_unit": "write degrees into the columns _deg",
-    "measured_columns": "correct the columns of the measurements",
-    "measured_unit": "write degrees into the columns _deg of the measurements",
-}
 
-
-def check_joint_log(robot: RobotModel, inputs: PoseInputs, recording: RobotRecording, kernel: Kernel) -> None:
+def check_joint_log(robot: RobotModel, inputs: PoseInputs, recording: RobotRecording, kernel: Kernel) -> list[Slip]:
     """Refuse recordings in which joint angles and measurements do not belong together.
+
+    Returns
+    -------
+    What the robot has every right to be (other zeros, another length) but its file does not say: to be told.
 
     Raises
     ------
-    InvalidInput : a fault that explains the miss was found; the message gives the proof and the remedy.
+    InvalidInput : a slip explains the miss; the message gives the proof and the remedy, and all candidates.
     """
     _check_unit(inputs, recording, kernel)
-    fault = fault_of(robot, inputs, recording, kernel)
-    if fault:
-        raise InvalidInput(f"joint angles and measurements do not belong together: {fault}")
+    found = find_slips(robot, inputs, recording.observations)
+    if found and not found[0].legitimate:
+        raise InvalidInput(f"joint angles and measurements do not belong together: {told(found)}")
+    return found
 
 
 def check_failed_fit(
@@ -57,7 +57,7 @@ def check_failed_fit(
         return
     rows = np.arange(min(len(inputs), MOST_POSES))
     few = replace(recording, observations=recording.select(rows))
-    fault = fault_of(robot, inputs.subset(rows), few, kernel, share=0.0)
+    fault = fault_of(robot, inputs.subset(rows), few, share=0.0)
     if fault:
         raise InvalidInput(f"joint angles and measurements do not belong together: {fault}")
     T = found.kernel.frames(found.kernel.theta0, inputs)
@@ -71,14 +71,18 @@ def check_failed_fit(
         )
 
 
-def fault_of(
-    robot: RobotModel, inputs: PoseInputs, recording: RobotRecording, kernel: Kernel, share: float = SUSPICIOUS_SHARE
-) -> str:
+def fault_of(robot: RobotModel, inputs: PoseInputs, recording: RobotRecording, share: float = SUSPICIOUS_SHARE) -> str:
     """The likeliest slip with proof and remedy; empty if there is none."""
-    found = likely_causes(robot, inputs, recording.observations, kernel, share)
-    if not found:
+    return told([s for s in find_slips(robot, inputs, recording.observations, share) if not s.legitimate])
+
+
+def told(slips: Sequence[Slip]) -> str:
+    """Slips in a sentence: the likeliest with proof and remedy, then the others that explain as much."""
+    if not slips:
         return ""
-    return f"{found[0].statement}: {_REMEDIES.get(found[0].kind, 'correct the recording')}"
+    others = [f"{slip.statement.split(': mending')[0]} ({slip.remedy})" for slip in slips[1:MOST_TOLD]]
+    also = f"; the recording alone cannot tell this from: {'; or '.join(others)}" if others else ""
+    return f"{slips[0].statement}: {slips[0].remedy}{also}"
 
 
 def _check_unit(inputs: PoseInputs, recording: RobotRecording, kernel: Kernel) -> None:

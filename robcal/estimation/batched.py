@@ -36,13 +36,14 @@ class NormalEquations:
 
         Rows that are not finite take no part in the step but make the cost of their problem infinite.
         """
-        cost = sum_by(group, np.sum(r**2, axis=1), n)
         finite = np.asarray(np.isfinite(r).all(axis=1) & np.isfinite(J).all(axis=(1, 2)))
         if not finite.all():
             r, J = np.where(finite[:, None], r, 0.0), np.where(finite[:, None, None], J, 0.0)
         turned = np.swapaxes(J, -1, -2)
         matrix, right = sum_by(group, turned @ J, n), sum_by(group, (turned @ r[..., None])[..., 0], n)
-        return cls(matrix, right, np.where(np.isfinite(cost), cost, np.inf))
+        cost = sum_by(group, np.sum(r**2, axis=1), n)
+        cost[group[~finite]] = np.inf
+        return cls(matrix, right, cost)
 
     def take(self, rows: IntArray | NDArray[np.bool_]) -> NormalEquations:
         """The chosen problems."""

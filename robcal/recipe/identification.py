@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -32,6 +32,11 @@ class Identification:
     robot: IdentifiedRobot = field(repr=False)
     recording: RobotRecording = field(repr=False)
 
+    @property
+    def sound(self) -> Rows:
+        """Rows (k,) of the poses that were identified from, without those that were left out as blunders."""
+        return self.rows[self.robot.used]
+
     def kept_out(self, log: JointLog) -> Rows:
         """Rows (k,) of measured poses that took no part."""
         return np.array([i for i in self.recording.poses if log.verify[i]], dtype=np.int64)
@@ -52,9 +57,16 @@ def identify_robot(
         raise InvalidInput("no measured pose is left to identify from: set 'identify' in the column set")
     kernel = Kernel(model, options.statics)
     inputs = log.inputs(kernel)
-    check_joint_log(model, inputs, recording, kernel)
-    nominal = fit_nominal(model, inputs.subset(rows), recording.select(rows))
-    found, recording = identify_recording(model, inputs, recording, rows, options, kernel)
+    slips = check_joint_log(model, inputs, recording, kernel)
+    start = model
+    if slips:
+        start = model.with_parameters({**model.parameters, **slips[0].values})
+        kernel = Kernel(start, options.statics)
+        recording = replace(recording, notes=(*recording.notes, f"{slips[0].statement}; {slips[0].remedy}"))
+    found, recording = identify_recording(start, inputs, recording, rows, options, kernel)
     if recording.stated:
         check_failed_fit(model, inputs, recording, kernel, found)
+    # what was left out as a blunder says nothing about the nominal robot either
+    sound = rows[found.used]
+    nominal = fit_nominal(model, inputs.subset(sound), recording.select(sound))
     return Identification(rows, found.with_recording(log, nominal.model), recording)

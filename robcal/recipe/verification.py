@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from robcal.calibration.calibrated import CalibratedRobot
 from robcal.calibration.cell import with_fitted_cell
-from robcal.calibration.identification import IdentifyOptions
+from robcal.calibration.identification import IdentifiedRobot, IdentifyOptions
 from robcal.calibration.joint_log import JointLog
 from robcal.calibration.measurements import RobotRecording, Rows, well_measured
 from robcal.calibration.observations import FrameObservations
-from robcal.calibration.verification import Verification, cross_validate, fit_nominal, repetitions, verify
+from robcal.calibration.verification import Verification, cross_validate, fit_nominal, repetitions, tool_errors, verify
 from robcal.errors import InvalidInput
 from robcal.recipe.identification import Identification
+from robcal.robot.kernel import PoseInputs
 from robcal.robot.model import RobotModel
 from robcal.transforms import Array, difference
 
 FOLDS = 5
+BLUNDER, LEAST_BLUNDER = 5.0, 0.02
+"""A kept-out pose is no measurement of this robot if the nominal one misses it by this factor more than any other pose,
+and by this much (m) more."""
 SIGMAS = 4.0
 """Standard errors by which the mean of the residuals may differ from zero."""
 
@@ -58,7 +63,7 @@ def verify_robot(
     freed : the measurements without what the diagnosis found in the measuring system.
     relative : covariance (p, p) of the robot's parameters against frames of the own station.
     """
-    rows, recording = identification.rows, identification.recording
+    rows, recording = identification.sound, identification.recording
     stated, inputs = robot.inputs(log.as_stated()), log.inputs(robot.kernel)
     kept_out, notes = well_measured(recording, identification.kept_out(log), log.names)
     if not len(kept_out):
@@ -80,6 +85,8 @@ def verify_robot(
         nominal = fit_nominal(model, stated.subset(kept_out), recording.select(kept_out))
     else:
         nominal = fit_nominal(model, stated.subset(rows), recording.select(rows))
+        kept_out, said = without_blunders(nominal, stated, recording, rows, kept_out, log.names)
+        notes = [*notes, *said]
     outcome = verify(tested, stated.subset(kept_out), recording.select(kept_out), nominal)
     if relative is not None:
         # in the world, the robot is as uncertain as the station as well
@@ -114,7 +121,7 @@ def _foreign(recording: RobotRecording, rows: Rows, kept_out: Rows) -> str:
 
 def datum_note(identification: Identification, robot: CalibratedRobot, log: JointLog) -> str:
     """Where measured frames and predictions at the identified poses do not agree in the mean; empty if they do."""
-    rows = identification.rows[identification.robot.used]
+    rows = identification.sound
     T = robot.predict(robot.inputs(log.as_stated()).subset(rows))[0]
     for o in identification.recording.select(rows):
         if not isinstance(o, FrameObservations) or len(o.pose) < 3:
@@ -126,3 +133,36 @@ def datum_note(identification: Identification, robot: CalibratedRobot, log: Join
             told = ", ".join(f"{1e3 * m:+.3g} +- {1e3 * s:.2g}" for m, s in zip(mean, sigma, strict=True))
             return f"predictions differ from the measured frames by {told} mm in the mean (x, y, z)"
     return ""
+
+
+def without_blunders(
+    nominal: IdentifiedRobot,
+    inputs: PoseInputs,
+    recording: RobotRecording,
+    rows: Rows,
+    kept_out: Rows,
+    names: Sequence[str],
+) -> tuple[Rows, list[str]]:
+    """Kept-out poses without those that contradict even the nominal robot, which has seen none of them."""
+    usual = max(tool_miss(nominal, inputs, recording, rows).values(), default=0.0)
+    limit = max(BLUNDER * usual, usual + LEAST_BLUNDER)
+    found = {pose: miss for pose, miss in tool_miss(nominal, inputs, recording, kept_out).items() if miss > limit}
+    if not found or len(found) > len(kept_out) / 2:
+        return kept_out, []
+    notes = [
+        f"kept-out pose '{names[pose]}' was left out: measured {1e3 * miss:.3g} mm from where even the nominal robot "
+        f"is ({1e3 * usual:.2g} mm at most elsewhere), which is no error of a robot"
+        for pose, miss in found.items()
+    ]
+    return kept_out[~np.isin(kept_out, list(found))], notes
+
+
+def tool_miss(robot: IdentifiedRobot, inputs: PoseInputs, recording: RobotRecording, rows: Rows) -> dict[int, float]:
+    """Largest miss (m) of what was measured, by row of the pose."""
+    observations = recording.select(rows)
+    T, _ = robot.predict(inputs.subset(rows))
+    out: dict[int, float] = {}
+    for pose, miss in zip(*tool_errors(T, observations)["0"], strict=True):
+        row = int(rows[pose])
+        out[row] = max(out.get(row, 0.0), float(miss))
+    return out

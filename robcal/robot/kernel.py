@@ -6,6 +6,7 @@ fed with numpy arrays without copying.
 
 from __future__ import annotations
 
+import re
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -224,7 +225,7 @@ class Kernel:
             out[f"q{k + 1}"] = poses.q[:, k]
             own = f"{identifier(f.name)}_force" if f.prismatic else f"{identifier(f.name)}_m{f.joint_kind}"
             out[f"torque{k + 1}"] = f.sign * out[own]
-            out[f"approach{k + 1}"] = np.zeros(len(poses))
+            out[f"approach{k + 1}"] = out[f"move{k + 1}"] = np.zeros(len(poses))
         masses = [p.mass + np.asarray(theta)[self.index[f"payload.{n}.mass"]] for n, p in self.model.payloads.items()]
         out["payload_mass"] = poses.load @ np.array(masses) if masses else np.zeros(len(poses))
         return {**out, **poses.covariates}
@@ -275,7 +276,7 @@ class Kernel:
         for k, name in enumerate(self.covariates):
             if name in poses.covariates:
                 table[:, k] = poses.covariates[name]
-            elif not (name.startswith("approach") and name[8:].isdigit()):
+            elif not re.fullmatch(r"(approach|move)\d+", name):
                 raise InvalidInput(f"a term of robot '{self.model.name}' needs column '{name}', the poses have none")
         return table
 

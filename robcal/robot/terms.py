@@ -10,7 +10,8 @@ accepted: numbers, names, ``+ - * / **`` (exponent a plain number up to 16), com
 
 Names are the term's own parameters (short names) or variables:
 
-- ``q1..qN`` (sense of q, rad or m), ``approach1..N`` (-1, 0, +1; 0 where not recorded),
+- ``q1..qN`` (sense of q, rad or m), ``approach1..N`` (-1, 0, +1; 0 where not recorded), ``move1..N`` (last move of the
+  joint, rad or m; 0 where not recorded),
 - ``torque1..N``: static moment of the weights about the joint's own line in the sense of q (N m; N if sliding),
 - ``<frame>_mroll``, ``_mpitch``, ``_myaw``: moment about the line about which that angle turns (N m),
 - ``base_mx``, ``base_my``, ``base_mz``: moment about the base origin in base coordinates (N m),

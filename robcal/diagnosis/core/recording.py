@@ -98,11 +98,6 @@ class Recording:
         columns = np.linalg.solve(L, self.common).reshape(-1, self.common.shape[2])
         return CommonNoise(columns if self.shared is None else self.shared.whiten(columns))
 
-    @cached_property
-    def laws(self) -> dict[tuple[str | float, ...], Array]:
-        """Values (n,) of expressions already evaluated that depend on the recording alone, not on the model."""
-        return {}
-
     @property
     def scatter(self) -> float:
         """Variance of the joints in units of the variance factor; zero where none was seen."""

@@ -13,7 +13,7 @@ from robcal.diagnosis.noise.blunders import Suspect, worst_group
 from robcal.diagnosis.scan.family_wise import FamilyWise, simulate, tails
 from robcal.diagnosis.scan.posterior import Posterior, posterior
 from robcal.diagnosis.scan.statistics import ScanResult, Stack, orthonormal_basis, restack, scan, stack_entries
-from robcal.diagnosis.scan.tangents import Tangents, entries, tangents
+from robcal.diagnosis.scan.tangents import Laws, Tangents, entries, tangents
 from robcal.physics.cause import Array, Constants, LinearCause, ObservationData
 from robcal.physics.empirical import empirical_causes
 from robcal.physics.library import all_causes
@@ -75,10 +75,16 @@ def library_at(fit: Fit, recording: Recording, at: Tangents, tied: frozenset[str
 
 
 def analyse(
-    fit: Fit, recording: Recording, tied: frozenset[str], *, runs: int = 400, level: FamilyWise | None = None
+    fit: Fit,
+    recording: Recording,
+    tied: frozenset[str],
+    *,
+    runs: int = 400,
+    level: FamilyWise | None = None,
+    laws: Laws | None = None,
 ) -> Analysis:
     """Scan all candidates at a fit; `level` reuses a simulated family-wise level of the same design."""
-    at = tangents(fit, recording)
+    at = tangents(fit, recording, laws)
     causes = library_at(fit, recording, at, tied)
     basis = orthonormal_basis(fit.jacobian)
     return _ranked(fit, at, causes, stack_entries(entries(causes, at), basis), basis, runs, level)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
@@ -13,6 +12,28 @@ from robcal.diagnosis.core.recording import Recording, observation_data
 from robcal.diagnosis.scan.statistics import Entry
 from robcal.physics.cause import Array, Basis, Constants, LinearCause, ObservationCause, ObservationData
 from robcal.robot.terms import names_in
+
+
+class Laws:
+    """Values of expressions at the poses of one recording.
+
+    Those that depend on the recording alone, not on the model, are evaluated once for all fits that share the object.
+    """
+
+    def __init__(self, recording: Recording) -> None:
+        joints = (f"q{k + 1}" for k in range(recording.q.shape[1]))
+        self._recorded = frozenset([*recording.covariates, *joints])
+        self._known: dict[tuple[str | float, ...], Array] = {}
+
+    def value(self, basis: Basis, variables: Mapping[str, Array]) -> Array:
+        """Value (n,) of a law; `variables` are those of the present fit."""
+        key: tuple[str | float, ...] = (basis.template, *basis.constants.values())
+        if key in self._known:
+            return self._known[key]
+        value = np.broadcast_to(basis.value(variables), variables["index"].shape)
+        if names_in(basis.template).difference(basis.constants) <= self._recorded:
+            self._known[key] = value
+        return value
 
 
 @dataclass(frozen=True)
@@ -34,6 +55,7 @@ class Tangents:
     row_pose: Array
     frames: Array
     data: ObservationData
+    laws: Laws
 
     def columns(self, cause: LinearCause, constants: Constants) -> Array:
         """Whitened columns (m, c) of a cause per unit amplitude."""
@@ -44,28 +66,13 @@ class Tangents:
         names = cause.names(constants)
         out = np.zeros((len(self.row_pose), len(names)))
         for basis in cause.laws(constants):
-            law = self._law(basis)
+            law = self.laws.value(basis, self.variables)
             out[:, names.index(basis.parameter)] += self.motion[basis.frame, basis.kind] * law[self.row_pose]
         return self.recording.beside_common(out)
 
-    def _law(self, basis: Basis) -> Array:
-        """Value (n,) of an expression; what does not depend on moments is kept for later fits of the recording."""
-        key: tuple[str | float, ...] = (basis.template, *basis.constants.values())
-        known = self.recording.laws.get(key)
-        if known is None:
-            known = np.broadcast_to(basis.value(self.variables), self.variables["index"].shape)
-            names = names_in(basis.template).difference(basis.constants)
-            if all(name in self.recording.covariates or name in self._joints for name in names):
-                self.recording.laws[key] = known
-        return known
 
-    @cached_property
-    def _joints(self) -> frozenset[str]:
-        return frozenset(f"q{k + 1}" for k in range(self.recording.q.shape[1]))
-
-
-def tangents(fit: Fit, recording: Recording) -> Tangents:
-    """Tangents at a fit."""
+def tangents(fit: Fit, recording: Recording, laws: Laws | None = None) -> Tangents:
+    """Tangents at a fit; `laws` are shared by several fits of the same poses."""
     kernel = fit.kernel
     basis = kernel.scan_basis(fit.theta, fit.inputs)
     _, motion = replace(recording, common=None).linearise(fit.frames, basis.J)
@@ -81,6 +88,7 @@ def tangents(fit: Fit, recording: Recording) -> Tangents:
         fit.row_pose,
         fit.frames,
         observation_data(recording, fit.frames, variables),
+        Laws(recording) if laws is None else laws,
     )
 
 

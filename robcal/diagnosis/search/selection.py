@@ -18,6 +18,7 @@ from robcal.diagnosis.scan.analysis import Analysis, accepted_from, analyse, ext
 from robcal.diagnosis.scan.family_wise import FamilyWise
 from robcal.diagnosis.scan.posterior import refine
 from robcal.diagnosis.scan.statistics import orthonormal_basis
+from robcal.diagnosis.scan.tangents import Laws
 from robcal.physics.cause import Array, Constants, Key, LinearCause
 from robcal.physics.prior_scale import prior_scale
 from robcal.robot.model import RobotModel
@@ -107,9 +108,10 @@ def select(
     without: tuple[Analysis, ...] = ()
     settled, weighed = False, True
     present = fit(model, recording, free)
+    laws = Laws(recording)
     while True:
         known = level if first is None else first.family_wise
-        analysis = analyse(present, recording, tied, runs=settings.runs, level=known)
+        analysis = analyse(present, recording, tied, runs=settings.runs, level=known, laws=laws)
         seen = newly_visible(analysis, tied) if accepted else ()
         if seen:
             free, tied = (*free, *seen), tied - set(seen)

@@ -21,12 +21,12 @@ from robcal.photogrammetry.bundle.normals import MarkOrder, State
 from robcal.photogrammetry.bundle.solver import Bars, Problem, minimise
 from robcal.photogrammetry.core.camera import Camera, project
 from robcal.photogrammetry.core.network import ImageMarks
+from robcal.photogrammetry.orientation.robust_pose import ideal_points, robust_pose, truncated_cost
 from robcal.photogrammetry.orientation.start_planar import best_references, planar_starts, plane_share
-from robcal.photogrammetry.orientation.start_resection import ideal_points, resect, robust_cost
 from robcal.transforms import Array, frame
 
 _TRUNCATED = 9.0
-"""Value of :func:`robust_cost` for a mark that does not fit at all."""
+"""Value of :func:`truncated_cost` for a mark that does not fit at all."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,6 @@ def approximate_network(
     *,
     focal_known: bool,
     known_points: Array | None = None,
-    seed: int = 0,
 ) -> StartNetwork:
     """Approximate values of a network of identified marks.
 
@@ -77,8 +76,7 @@ def approximate_network(
     ------
     DegenerateGeometry : no seed explains at least two images.
     """
-    rng = np.random.default_rng(seed)
-    builder = _Builder(marks, images, targets, camera, focal_known, rng)
+    builder = _Builder(marks, images, targets, camera, focal_known)
     candidates: list[StartNetwork] = []
     core = builder.core_images()
     for seed_network in builder.seeds(known_points, core):
@@ -103,11 +101,9 @@ def approximate_network(
 class _Builder:
     """Marks of one body and the steps that place images and targets."""
 
-    def __init__(
-        self, marks: ImageMarks, images: int, targets: int, camera: Camera, focal_known: bool, rng: np.random.Generator
-    ) -> None:
+    def __init__(self, marks: ImageMarks, images: int, targets: int, camera: Camera, focal_known: bool) -> None:
         self.marks, self.images, self.targets = marks, images, targets
-        self.camera, self.focal_known, self.rng = camera, focal_known, rng
+        self.camera, self.focal_known = camera, focal_known
         self.size = float(max(camera.width, camera.height))
         self.rows = [np.flatnonzero(marks.image == j) for j in range(images)]
         seen = np.zeros((images, targets))
@@ -261,12 +257,11 @@ class _Builder:
             options.sort(key=lambda j: -count[j])
             for j in options[: max(1, int(np.count_nonzero(placed)))]:
                 rows = self.rows[j][located[self.marks.target[self.rows[j]]]]
-                found = resect(
+                found = robust_pose(
                     network.camera,
                     network.points[self.marks.target[rows]],
                     self.marks.xy[rows],
                     self.tolerance(adjusted_at > 6),
-                    self.rng,
                 )
                 if found is None or np.count_nonzero(found.inliers) < max(4, 0.5 * len(rows)):
                     failed[j] = count[j]
@@ -287,7 +282,8 @@ class _Builder:
         length = self._lengths(network)
         scale = self.tolerance(final)
         mine = np.isin(self.marks.image, images)
-        return replace(network, fits=length < 3.0 * scale, cost=robust_cost(length[mine], 0.25 * self.tolerance(False)))
+        cost = float(truncated_cost(length[mine], 0.25 * self.tolerance(False)))
+        return replace(network, fits=length < 3.0 * scale, cost=cost)
 
     def is_good(self, network: StartNetwork, core: NDArray[np.int64]) -> bool:
         """Most marks of the core are reached, and nearly all of these fit within a thousandth of the image."""

@@ -8,9 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,14 +16,11 @@ from robcal.errors import DegenerateGeometry, InvalidInput
 from robcal.estimation.batched import NormalEquations, minimise_each
 from robcal.estimation.grouping import members, whitener
 from robcal.estimation.summary import TerminationSettings
-from robcal.photogrammetry.core.bodies import Body, IntArray, line_ratio, thickness_ratio
-from robcal.photogrammetry.core.camera import Camera, normalise, project, project_with_jacobians
+from robcal.photogrammetry.core.bodies import Body, IntArray, line_ratio
+from robcal.photogrammetry.core.camera import Camera, project, project_with_jacobians
 from robcal.photogrammetry.core.eccentric_circle import effective_point
-from robcal.photogrammetry.orientation.p3p import three_point_poses
-from robcal.transforms import Array, frame, invert, retract, skew, transform
-
-_LINE = 0.01
-"""Targets whose spread across their line is below this share of its length carry no pose."""
+from robcal.photogrammetry.orientation.closed_form import LINE, start_poses, three_point_search
+from robcal.transforms import Array, invert, retract, skew, transform
 
 
 @dataclass(frozen=True)
@@ -136,71 +131,6 @@ def _turned_little(T: Array, step: Array) -> Array:
     return retract(T, step * np.minimum(1.0, 0.5 / np.maximum(angle, 1e-300)))
 
 
-def start_poses(camera: Camera, xy: Array, points: Array) -> list[Array]:
-    """Closed-form poses camera_T_body of at least three marks, the likelier first; empty where none exists.
-
-    Raises
-    ------
-    DegenerateGeometry : fewer than three marks, or all in one line.
-    """
-    if len(points) < 3:
-        raise DegenerateGeometry(f"a resection needs at least three targets in the image, got {len(points)}")
-    if line_ratio(points) < _LINE:
-        raise DegenerateGeometry("the targets seen lie in one line: their image does not fix a pose")
-    ideal = normalise(camera, xy)
-    use = np.isfinite(ideal).all(axis=1)
-    if use.sum() < 3:
-        return []
-    ideal, object_points = ideal[use], np.ascontiguousarray(points[use])
-    if len(ideal) == 3:
-        return [T for T in three_point_poses(ideal[None], object_points[None])[0] if np.isfinite(T).all()]
-    flat = thickness_ratio(object_points) < 0.02
-    found: list[Array] = []
-    methods = [cv2.SOLVEPNP_IPPE, cv2.SOLVEPNP_SQPNP] if flat else [cv2.SOLVEPNP_SQPNP]
-    for method in methods:
-        try:
-            _, rotations, translations, _ = cv2.solvePnPGeneric(
-                object_points, np.ascontiguousarray(ideal[:, None]), np.eye(3), None, flags=method
-            )
-        except cv2.error:  # degenerate for this solver; the other one or the three-point search may still do
-            continue
-        for rotation, translation in zip(rotations, translations, strict=True):
-            T = frame(cv2.Rodrigues(rotation)[0], np.ravel(translation))
-            if np.isfinite(T).all() and np.all(transform(T, object_points)[:, 2] > 0):
-                found.append(T)
-        if flat and len(found) >= 2:
-            break
-    return found
-
-
-def robust_start(
-    camera: Camera, xy: Array, points: Array, *, tolerance_px: float, seed: int = 1, triples: int = 300
-) -> tuple[Array | None, NDArray[np.bool_]]:
-    """Pose that most marks agree with, although some are misidentified: three-point solutions, counted inliers.
-
-    Returns the pose (None where no triple works) and the mask of marks within ``tolerance_px`` of it.
-    """
-    ideal = normalise(camera, xy)
-    usable = np.flatnonzero(np.isfinite(ideal).all(axis=1))
-    none = np.zeros(len(xy), dtype=bool)
-    if len(usable) < 3:
-        return None, none
-    if len(usable) <= 13:
-        chosen = np.array(list(combinations(usable, 3)))
-    else:
-        rng = np.random.default_rng(seed)
-        chosen = np.array([rng.choice(usable, 3, replace=False) for _ in range(triples)])
-    poses = three_point_poses(ideal[chosen], points[chosen]).reshape(-1, 4, 4)
-    poses = poses[np.isfinite(poses[:, 0, 0])]
-    if len(poses) == 0:
-        return None, none
-    miss = np.linalg.norm(project(camera, transform(poses[:, None], points)) - xy, axis=-1)
-    miss = np.where(np.isfinite(miss), miss, np.inf)
-    score = np.sum(np.minimum(miss / tolerance_px, 1.0) ** 2, axis=1)
-    best = int(np.argmin(score))
-    return poses[best], miss[best] < tolerance_px
-
-
 def resect(
     camera: Camera,
     ids: Sequence[int] | IntArray,
@@ -286,7 +216,7 @@ def resect_images(
         if found is not None:
             pose, inside[i] = found
             again.append((i, pose, inside[i]))
-            if line_ratio(data.points[inside[i]]) > _LINE:
+            if line_ratio(data.points[inside[i]]) > LINE:
                 again += [(i, T, inside[i]) for T in start_poses(camera, data.xy[inside[i]], data.points[inside[i]])]
         # else: no consistent subset of four; the fit to all marks stands, with its large chi-square
     for i, better in enumerate(_refine_tasks(data, again, k)):
@@ -349,7 +279,7 @@ def _refine_tasks(data: _Marks, tasks: list[tuple[int, Array, IntArray]], k: int
 def _without_outliers(data: _Marks, rows: IntArray, gate: float) -> tuple[Array, IntArray] | None:
     """Pose and rows of the marks that agree with it (at least four), by three-point search and re-selection."""
     sigma = float(np.sqrt(np.median(np.einsum("mii->m", data.covariance[rows])) / 2))
-    pose, near = robust_start(data.camera, data.xy[rows], data.points[rows], tolerance_px=3 * gate * sigma)
+    pose, near = three_point_search(data.camera, data.xy[rows], data.points[rows], tolerance_px=3 * gate * sigma)
     if pose is None or near.sum() < 4:
         return None
     for _ in range(4):

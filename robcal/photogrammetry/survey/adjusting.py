@@ -79,7 +79,6 @@ def _start(given: SurveyInput, table: Assignments) -> tuple[Assignments, Approxi
         given.camera,
         focal_known=given.camera_known,
         known_points=known if np.isfinite(known).any() else None,
-        seed=given.settings.seed,
     )
     unplaced = []
     for j in np.flatnonzero(~start.placed):

@@ -5,14 +5,15 @@ Three points leave up to four poses; the right one is told by the other known ta
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
+from robcal.errors import DegenerateGeometry
 from robcal.photogrammetry.core.camera import Camera, project
 from robcal.photogrammetry.core.network import IntArray
-from robcal.photogrammetry.orientation.start_resection import ideal_points, refine
-from robcal.transforms import Array, frame, transform
+from robcal.photogrammetry.orientation.closed_form import start_poses
+from robcal.photogrammetry.orientation.robust_pose import refine_robust
+from robcal.transforms import Array, transform
 
 _MATCHES = 8
 _SHARE = 0.5
@@ -28,25 +29,18 @@ def place_late(
     points : (t, 3) all known targets. identified : (3,) rows of the identified ones, at ``xy_identified`` (3, 2).
     xy_all : (d, 2) all detections. gate : px within which a target meets a detection.
     """
-    centre = points.mean(axis=0)
-    ideal = ideal_points(camera, xy_identified)
     try:
-        _, rvecs, tvecs = cv2.solveP3P(
-            (points[identified] - centre)[:, None], ideal[:, None], np.eye(3), None, flags=cv2.SOLVEPNP_AP3P
-        )
-    except cv2.error:
+        starts = start_poses(camera, xy_identified, points[identified])
+    except DegenerateGeometry:
         return None  # three targets in one line carry no pose
     tree = cKDTree(xy_all)
     best: tuple[int, Array] | None = None
-    for r, t in zip(rvecs, tvecs, strict=True):
-        T = frame(cv2.Rodrigues(np.asarray(r, dtype=float))[0], np.ravel(t)) @ frame(np.eye(3), -centre)
-        if not np.all(np.isfinite(T)):
-            continue
+    for T in starts:
         for _ in range(3):
             rows, hits = _meetings(camera, T, points, tree, gate)
             if len(rows) < _MATCHES:
                 break
-            T = refine(camera, T, points[rows], xy_all[hits], gate / 3.0)
+            T = refine_robust(camera, T[None], points[rows], xy_all[hits], gate / 3.0)[0]
         rows, hits = _meetings(camera, T, points, tree, gate / 3.0)
         if len(rows) >= max(_MATCHES, _SHARE * len(xy_all)) and (best is None or len(rows) > best[0]):
             best = len(rows), T

@@ -48,7 +48,6 @@ class SurveySettings:
     new_points : look for uncoded dots without coordinates. min_images : images a new point must be seen in.
     eccentricity : model the eccentricity of ellipse centres where a diameter is known.
     reach : new points farther from the body's centre than this many of its radii are no targets.
-    seed : of the random samples of the start.
     """
 
     adjust: AdjustSettings = field(default_factory=AdjustSettings)
@@ -57,7 +56,6 @@ class SurveySettings:
     min_images: int = 3
     eccentricity: bool = True
     reach: float = 1.6
-    seed: int = 0
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,8 @@ from robcal.errors import DegenerateGeometry
 from robcal.photogrammetry.bundle.start_network import approximate_network
 from robcal.photogrammetry.core.camera import Camera, project
 from robcal.photogrammetry.core.network import ImageMarks
+from robcal.photogrammetry.orientation.robust_pose import robust_pose
 from robcal.photogrammetry.orientation.start_planar import best_references, planar_starts, plane_share
-from robcal.photogrammetry.orientation.start_resection import resect
 from robcal.transforms import difference, transform
 from tests.photogrammetry.networks import make_network
 
@@ -23,13 +23,13 @@ def test_resection_with_wrong_ids(body: str) -> None:
         rows = np.flatnonzero(truth.marks.image == j)[:10]
         X, xy = truth.points[truth.marks.target[rows]], truth.marks.xy[rows].copy()
         xy[:2] = xy[1::-1] + np.array([40.0, -60.0])
-        found = resect(truth.camera, X, xy, 1.0, rng)
+        found = robust_pose(truth.camera, X, xy, 1.0)
         assert found is not None
         assert found.inliers.tolist() == [False] * 2 + [True] * (len(rows) - 2)
         d = difference(truth.camera_T_body[j], found.camera_T_body)
         assert np.linalg.norm(d[3:]) < 5e-3
-    assert resect(truth.camera, X[:3], xy[:3], 1.0, rng) is None
-    assert resect(truth.camera, X, rng.uniform(0, 1800, xy.shape), 1.0, rng) is None
+    assert robust_pose(truth.camera, X[:3], xy[:3], 1.0) is None
+    assert robust_pose(truth.camera, X, rng.uniform(0, 1800, xy.shape), 1.0) is None
 
 
 def test_planar_self_calibration_finds_focal_length_and_shape() -> None:
