@@ -58,36 +58,42 @@ def choose(recording: Recording, log: JointLog, rows: Rows, bare: Form, extended
     labels = blocked_folds(recording)
     fold = labels[recording.observations.pose]
 
-    def gain(before: Form, after: Form, given: JointLog, freed: bool) -> Gain:
+    def gain(before: Form, after: Form, given: JointLog, freed: bool) -> tuple[Gain, Gain]:
         fits = [form.fit(plain) for form in (before, after)]
         errors = [delivered_errors(plain, f, given.inputs(f.kernel).subset(rows), labels, freed=freed) for f in fits]
-        return gain_of(errors[0], errors[1], fold)
+        plain_gain, weighted = (gain_of(b, a, fold) for b, a in zip(*errors, strict=True))
+        return plain_gain, weighted
 
     stated = log.as_stated()
-    whole = gain(bare, extended, stated, False)
+    whole, _ = gain(bare, extended, stated, False)
     chosen, reasons = bare, []
     if extended.direct:
         beside = replace(bare, direct=extended.direct)
-        found = gain(bare, beside, stated, True)
+        found, _ = gain(bare, beside, stated, True)
         chosen = beside if found.clear else bare
-        reasons.append(_told("faults of the measuring", found, found.clear))
+        reasons.append(_told("faults of the measuring", found, found.clear, found))
     if extended.model.terms != bare.model.terms or set(extended.free) != set(bare.free):
         full = replace(extended, direct=chosen.direct)
-        found = gain(chosen, full, stated, True)
-        pays = found.pays
-        reasons.append(_told("terms of the robot", found, pays))
+        found, weighted = gain(chosen, full, stated, True)
+        pays = found.pays_beside(weighted)
+        reasons.append(_told("terms of the robot", found, pays, weighted))
         if not pays and log.inferred and found.even and found.after <= WAITING * found.before:
-            known = gain(chosen, full, log, True)
-            pays = known.pays
+            known, weighted = gain(chosen, full, log, True)
+            pays = known.pays_beside(weighted)
             if pays:
-                reasons[-1] = _told("terms of the robot, where approach directions are stated", known, True)
+                reasons[-1] = _told("terms of the robot, where approach directions are stated", known, True, weighted)
         chosen = full if pays else chosen
     reason = "; ".join(reasons) + ("" if chosen is not bare else "; the identified robot is delivered")
     return InForce(chosen, chosen is not bare, whole.before, whole.after, reason)
 
 
-def _told(what: str, found: Gain, accepted: bool) -> str:
+def _told(what: str, found: Gain, accepted: bool, weighted: Gain) -> str:
     errors = f"{1e3 * found.before:.3g} mm without, {1e3 * found.after:.3g} mm with them"
+    if accepted and not found.pays:
+        return (
+            f"{what} pay: error over blocked folds, weighted by its uncertainty, {weighted.before:.4g} without, "
+            f"{weighted.after:.4g} with them; in plain length {errors}"
+        )
     if accepted:
         return f"{what} pay: error over blocked folds {errors}"
     why = "the error does not fall enough"

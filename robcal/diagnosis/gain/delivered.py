@@ -23,6 +23,8 @@ MUCH_WORSE = 1.25
 """Factor by which the error in one fold may grow."""
 CLEAR, CLEAR_SIGMAS = 0.9, 3.0
 """Factor to which the error has to fall, and standard errors, for a fault of the measuring to be beyond doubt."""
+WEIGHTED_SIGMAS = 2.0
+"""Standard errors by which the weighted error has to fall where the plain one does not."""
 WAITING = 1.01
 """Factor by which the error may grow where terms wait for approach directions that the user may state."""
 
@@ -37,8 +39,8 @@ def blocked_folds(recording: Recording) -> Array:
 
 def delivered_errors(
     recording: Recording, fitted: Fit, inputs: PoseInputs, labels: Array, *, freed: bool = False
-) -> Array:
-    """Lengths (m_obs,) of the position errors, m, of each observation predicted from the other folds.
+) -> tuple[Array, Array]:
+    """Lengths (m_obs,) of the position errors, m, and of the whitened ones, of observations predicted from other folds.
 
     Parameters
     ----------
@@ -68,12 +70,13 @@ def delivered_errors(
         # base and tool are those of the measurements as they are
         left[test] = after[test] - jacobian[np.ix_(test, own)] @ solve(jacobian[np.ix_(~test, own)], after[~test])
     errors = plain.unwhiten(left[:, None], frames)[:, :3, 0]
-    return np.linalg.norm(errors, axis=1)
+    count = len(recording.observations.pose)
+    return np.linalg.norm(errors, axis=1), np.linalg.norm(left.reshape(count, -1), axis=1)
 
 
 @dataclass(frozen=True)
 class Gain:
-    """What a change of the robot gains: errors before and after (m, RMS), standard error, errors of the folds."""
+    """What a change of the robot gains: errors before and after (RMS), standard error, errors of the folds."""
 
     before: float
     after: float
@@ -85,6 +88,14 @@ class Gain:
     def pays(self) -> bool:
         """The error falls by more than its own standard error, and in no fold it grows much."""
         return self.before - self.after > self.sigma and self.even
+
+    def pays_beside(self, weighted: Gain) -> bool:
+        """The error falls, or that weighted by its uncertainty does beyond doubt while this one stays as it is.
+
+        Directions and places that are measured best show small effects which the plain length hides in noise.
+        """
+        falls = weighted.before - weighted.after > WEIGHTED_SIGMAS * weighted.sigma and weighted.even
+        return self.pays or (falls and self.even and self.after <= WAITING * self.before)
 
     @property
     def clear(self) -> bool:
