@@ -36,6 +36,7 @@ class ImageEntry:
     ----------
     source : ``survey/<body>`` or ``station/<camera>``; name : image name (for a station the pose id).
     key : name of its detections in the cache, None if it could not be read; size : (width, height).
+    contradicted : targets whose contour has another centre than the fit to their grey values.
     message : why there is nothing in it, or why it could not be read.
     """
 
@@ -48,6 +49,7 @@ class ImageEntry:
     codes: int
     saturated: int
     message: str = ""
+    contradicted: int = 0
 
 
 @dataclass(frozen=True)
@@ -131,7 +133,10 @@ def _detect(job: _Job) -> ImageEntry:
     height, width = found.shape
     read = int((found.code >= 0).sum())
     lit = int(found.saturated.sum())
-    return ImageEntry(job.source, job.name, job.path, job.key, (width, height), len(found), read, lit, found.message)
+    doubtful = int(found.contradicted.sum())
+    return ImageEntry(
+        job.source, job.name, job.path, job.key, (width, height), len(found), read, lit, found.message, doubtful
+    )
 
 
 def work(context: Context) -> Outcome:
@@ -195,7 +200,14 @@ def _check(source: str, images: ImageSource, entries: Sequence[ImageEntry]) -> l
             f"{own[0].path.parent}: no targets found in any of {len(own)} images{told}: check exposure, focus and that "
             "these are images of the body (bright dots on dark ground unless 'polarity: dark')"
         )
-    return [f"{entry.path}: {entry.message or 'no targets found'}: the image is left out" for entry in empty]
+    notes = [f"{entry.path}: {entry.message or 'no targets found'}: the image is left out" for entry in empty]
+    if doubtful := [entry for entry in own if entry.contradicted]:
+        total, worst = sum(e.contradicted for e in doubtful), max(doubtful, key=lambda e: e.contradicted)
+        notes.append(
+            f"{source}: {total} dots in {len(doubtful)} of {len(own)} images have a contour with another centre than "
+            f"their grey values (dirt, reflections, half covered?), most in {worst.path.name}"
+        )
+    return notes
 
 
 def load_detections(run: Run, index: DetectionIndex, source: str) -> dict[str, Detections]:
