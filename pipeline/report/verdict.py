@@ -133,8 +133,8 @@ def _taken_out(material: Material, v: Verification) -> str:
         return ""
     moved, sigma = (1e3 * float(np.sqrt(np.mean(x**2))) for x in (np.concatenate(shifts), v.predicted))
     return (
-        f" Faults of the measuring system that were found ({number(moved, 2)} mm RMS) are in these errors; the region is "
-        f"judged without them. A predicted place is known to {number(sigma, 2)} mm a direction."
+        f" Faults of the measuring system that were found ({number(moved, 2)} mm RMS) are in these errors; the "
+        f"region is judged without them. A predicted place is known to {number(sigma, 2)} mm a direction."
     )
 
 
