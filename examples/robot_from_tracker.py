@@ -30,7 +30,7 @@ def main() -> float:
         log = robcal.read_joint_log(folder / "poses.csv", model)
         recording = robcal.read_recording(folder / "frames.csv", log)
         found = robcal.identify_robot(model, log, recording)
-        verification, _, _ = robcal.verify_robot(model, found, found.robot, log)
+        verification = robcal.verify_robot(model, found, found.robot, log).delivered
         robcal.write_robot(folder / "calibrated.yaml", found.robot.model)
 
         frames, covariance = found.robot.predict(found.robot.inputs(log))

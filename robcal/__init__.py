@@ -70,6 +70,7 @@ if TYPE_CHECKING:  # loaded when first asked for: importing robcal takes millise
     from robcal.recipe.identification import identify_robot as identify_robot
     from robcal.recipe.robot_diagnosis import RobotDiagnosis as RobotDiagnosis
     from robcal.recipe.robot_diagnosis import diagnose_robot as diagnose_robot
+    from robcal.recipe.verification import RobotVerification as RobotVerification
     from robcal.recipe.verification import verify_robot as verify_robot
     from robcal.robot.compensation import Compensation as Compensation
     from robcal.robot.compensation import compensate as compensate
@@ -116,7 +117,7 @@ _HOMES = {
     "photogrammetry.survey.types": "BodyTarget SurveyImage SurveyResult",
     "recipe.identification": "Identification identify_robot",
     "recipe.robot_diagnosis": "RobotDiagnosis diagnose_robot",
-    "recipe.verification": "verify_robot",
+    "recipe.verification": "RobotVerification verify_robot",
     "robot.compensation": "Compensation compensate",
     "robot.dh": "DHRow frames_from_dh",
     "robot.export.c_export": "CSource export_c",
