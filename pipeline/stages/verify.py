@@ -9,13 +9,10 @@ import numpy as np
 
 from pipeline import artifacts
 from pipeline.codec import save_arrays
-from pipeline.poses_table import Poses
-from pipeline.robot_file import write_robot
 from pipeline.runs import Run
 from pipeline.stages.base import Context, Outcome, Stage, no_files
 from pipeline.stages.identify import load_calibrated, options_of, require_robot
 from pipeline.stages.survey import located
-from pipeline.tables import write_table
 from robcal.calibration.calibrated import CalibratedRobot
 from robcal.calibration.measurements import RobotObservations
 from robcal.calibration.observations import (
@@ -26,6 +23,9 @@ from robcal.calibration.observations import (
 )
 from robcal.calibration.verification import ErrorStatistics
 from robcal.errors import InvalidInput
+from robcal.files.poses_table import Poses
+from robcal.files.robot_file import write_robot
+from robcal.files.tables import write_table
 from robcal.recipe.verification import RobotVerification, datum_note, verify_robot
 from robcal.robot.model import parameter_unit
 
