@@ -20,8 +20,8 @@ from pipeline.prediction import compensate_run, predict_run
 from pipeline.runner import run_campaign
 from pipeline.runs import open_run
 from pipeline.stages.identify import load_calibrated
-from pipeline.tables import read_table
 from robcal.errors import InvalidInput
+from robcal.files.tables import read_table
 from robcal.robot.chain import chain_of, forward
 from robcal.robot.compensation import cell_frames
 from robcal.robot.model import Term

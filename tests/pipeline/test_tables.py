@@ -3,8 +3,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.tables import read_table, write_table
 from robcal.errors import InvalidInput
+from robcal.files.tables import read_table, write_table
 
 
 def table(folder: Path, content: str | bytes) -> Path:

@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.files import read_bytes
 from robcal.errors import InvalidInput
+from robcal.files.storage import read_bytes
 
 SUFFIXES = frozenset({".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp"})
 MAX_BYTES = 1_500_000_000
