@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.frame_tables import SIX, frame_covariance_columns, twist_from_six
+from pipeline.frame_tables import SIX, frame_covariance_columns, twist_covariance
 from pipeline.tables import Table, read_table
 from robcal.calibration.slips import empty_readings, frozen_readings
 from robcal.errors import InvalidInput
@@ -257,8 +257,7 @@ def _frame_covariance(table: Table, six: Array) -> Array | None:
         table.require(["sigma_mm", "sigma_deg"])
     else:
         return None
-    jacobian = twist_from_six(six) * scale
-    return _positive_definite(table, jacobian @ numbers @ np.swapaxes(jacobian, 1, 2))
+    return _positive_definite(table, twist_covariance(six, numbers * np.outer(scale, scale)))
 
 
 def _check_size(table: Table, values: Array) -> None:
