@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,8 +17,7 @@ from pipeline.stages.identify import load_calibrated
 from pipeline.tables import read_table, write_table
 from robcal.errors import InvalidInput
 from robcal.robot.compensation import cell_frames, compensate
-from robcal.robot.export.controller_formats import frame_program, joint_program
-from robcal.robot.model import RobotModel
+from robcal.robot.export.controller_formats import frame_program, joint_program, program_name
 from robcal.transforms import Array, frame_from_xyzrpy
 
 
@@ -114,7 +112,15 @@ def compensate_run(
     missed = [wanted.names[i] for i in rows if not result.converged[i]]
     warnings += [f"{frames}: frame '{name}' is met only approximately (near a singular pose?)" for name in missed]
     if program is not None:
-        write_text(out, _program(model, result.F_star[rows] if as_frames else result.q[rows], program, as_frames, out))
+        name, q = program_name(out.stem), result.q[rows]
+        if as_frames:
+            tool = cell_frames(calibrated.kernel)[1]
+            text = frame_program(result.F_star[rows], program, name, tool, model=model, q=q)
+            load = "has a load of 1 kg" if program == "rapid" else "is set without its load"
+            warnings.append(f"{out}: the calibrated tool {load}: give the controller the real load data")
+        else:
+            text = joint_program(model, q, program, name)
+        write_text(out, text)
     else:
         columns: dict[str, Sequence[object]] = {"pose": [wanted.names[i] for i in rows]}
         if as_frames:
@@ -133,12 +139,3 @@ def compensate_run(
         "uncompensated_mean_mm": float(np.nanmean(before)),
         "warnings": warnings,
     }
-
-
-def _program(model: RobotModel, values: Array, dialect: str, as_frames: bool, out: Path) -> str:
-    """Text of a controller's program, named after its file."""
-    word = re.sub(r"\W", "_", out.stem)[:24]
-    name = word if re.match(r"[A-Za-z]", word) else f"robcal_{word}"[:24]
-    if as_frames:
-        return frame_program(values, dialect, name, model.flange_T_tool)
-    return joint_program(model, values, dialect, name)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from robcal.errors import InvalidInput
-from robcal.robot.export.controller_formats import frame_program, joint_program, quaternion
+from robcal.robot.export.controller_formats import RESERVED, frame_program, joint_program, program_name, quaternion
 from robcal.robot.model import Frame, RobotModel
 from robcal.transforms import exp_so3, frame, frame_from_xyzrpy
 from tests.robot.chains import kr_like
@@ -81,3 +81,54 @@ def test_bad_requests_are_refused():
         frame_program(T, "krl", name="x(); halt")
     with pytest.raises(InvalidInput, match="finite"):
         joint_program(kr_like(), np.full((1, 6), np.nan), "krl")
+
+
+TOOL = frame_from_xyzrpy([0.1, -0.02, 0.3, 0.2, -0.1, np.pi / 2])
+
+
+def test_programs_of_frames_drive_the_calibrated_tool_from_a_known_configuration():
+    model = kr_like()
+    krl, rapid, script = (
+        frame_program(T, d, flange_T_tool=TOOL, model=model, q=Q).splitlines() for d in ("krl", "rapid", "urscript")
+    )
+    (tool,) = [line for line in krl if line.startswith("$TOOL")]
+    x, y, z, a, b, c = numbers(tool)
+    assert frame_from_xyzrpy([x / 1e3, y / 1e3, z / 1e3, *np.deg2rad([c, b, a])]) == pytest.approx(TOOL, abs=1e-6)
+    assert "$BASE = $ROBROOT" in krl
+    moves = [line for line in krl if line.startswith("PTP")]
+    assert [("E6AXIS" in line) for line in moves] == [True, False, False, False]
+    assert numbers(moves[0]) == pytest.approx(np.rad2deg(Q[0]), abs=1e-6)
+    assert krl.index(tool) < krl.index(moves[0])
+    (tcp,) = [line for line in script if "set_tcp" in line]
+    six = numbers(tcp)
+    assert frame(exp_so3(six[3:]), six[:3]) == pytest.approx(TOOL, abs=1e-8)
+    moves = [line for line in script if "movej" in line]
+    assert [("p[" in line) for line in moves] == [False, True, True, True]
+    moves = [line for line in rapid if "Move" in line]
+    assert [("MoveAbsJ" in line) for line in moves] == [True, False, False, False]
+
+
+def test_targets_of_a_robot_on_a_track_say_where_the_track_is():
+    model = RobotModel("on track", (Frame("track", "x", prismatic=True), *kr_like().frames))
+    q = np.concatenate([np.full((4, 1), 1.25), Q], axis=1)
+    krl = frame_program(T, "krl", model=model, q=q)
+    assert krl.count("E1 1250.0000") == 4
+    assert "$BASE = $NULLFRAME" in krl
+    assert frame_program(T, "rapid", model=model, q=q).count("[1250.0000,9E9") == 4
+    with pytest.raises(InvalidInput, match="sliding"):
+        frame_program(T, "urscript", model=model, q=q)
+
+
+@pytest.mark.parametrize("text", ["prüf_frames", "main", "end", "2 parts", "Straße", "", "日本", "x" * 60, "PTP"])
+def test_names_of_files_become_names_that_controllers_take(text):
+    name = program_name(text)
+    assert re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,23}", name)
+    assert name.lower() not in RESERVED
+    for dialect in ("krl", "rapid", "urscript"):
+        assert name in frame_program(T, dialect, name)
+
+
+@pytest.mark.parametrize("name", ["prüf", "main", "End", "1a"])
+def test_names_that_no_controller_takes_are_refused(name):
+    with pytest.raises(InvalidInput, match="program name"):
+        frame_program(T, "rapid", name)
