@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.codec import save_arrays
+from pipeline.json_io import read_json
 from pipeline.poses_table import Poses
 from pipeline.robot_file import write_robot
 from pipeline.runs import Run
@@ -22,7 +23,9 @@ from robcal.calibration.observations import (
     PointObservations,
     SensorPointObservations,
 )
+from robcal.calibration.verdict import verdict
 from robcal.calibration.verification import ErrorStatistics, Verification
+from robcal.recipe.verdict import robot_facts
 from robcal.recipe.verification import verify_robot
 from robcal.robot.model import parameter_unit
 
@@ -47,7 +50,18 @@ def work(context: Context) -> Outcome:
     _write_covariance(run, calibrated)
     _write_residuals(run, poses, calibrated, (freed or identification.recording).observations)
     outputs = [run.save(NAME, (outcome, tested)), run.robot, run.covariance, run.residuals]
-    return Outcome({"verification": _result(outcome)}, outputs, notes)
+    diagnosis = read_json(run.diagnosis) if run.record("diagnose") is not None and run.diagnosis.is_file() else None
+    facts = robot_facts(identification, calibrated, poses, outcome, diagnosis, doubtful_coordinates(run))
+    found = verdict(facts)
+    told = {"grade": found.grade, "text": found.text, "reasons": list(found.reasons)}
+    return Outcome({"verification": _result(outcome), "verdict": told}, outputs, notes)
+
+
+def doubtful_coordinates(run: Run) -> list[str]:
+    """What the surveys say against the coordinates that were given."""
+    record = run.record("survey")
+    surveys = dict(record.result).get("survey", {}) if record is not None else {}
+    return [doubt for entry in surveys.values() for doubt in entry.get("contradictions", [])]
 
 
 def _write_covariance(run: Run, calibrated: CalibratedRobot) -> None:

@@ -35,10 +35,7 @@ def _page(order: str, big: bool, image: np.ndarray, tags: Tags, at: int, last: b
 
 def _write(path: Path, pages: list[tuple[np.ndarray, Tags]], order: str = "<", big: bool = False) -> Path:
     head = b"II" if order == "<" else b"MM"
-    if big:
-        raw = head + struct.pack(f"{order}HHHQ", 43, 8, 0, 16)
-    else:
-        raw = head + struct.pack(f"{order}HI", 42, 8)
+    raw = head + (struct.pack(f"{order}HHHQ", 43, 8, 0, 16) if big else struct.pack(f"{order}HI", 42, 8))
     for k, (image, tags) in enumerate(pages):
         raw += _page(order, big, image, tags, len(raw), k == len(pages) - 1)
     path.write_bytes(raw)
