@@ -13,7 +13,14 @@ from pipeline.camera_file import CameraFile, read_camera
 from pipeline.camera_import import split_choice
 from pipeline.campaign_schema import FORMAT, CampaignEntry, StationCameraEntry, SurveyEntry
 from pipeline.images import list_images
-from pipeline.measurement_tables import MarksTable, MeasuredTable, read_marks, read_measurements, without_frozen
+from pipeline.measurement_tables import (
+    MarksTable,
+    MeasuredTable,
+    check_marks,
+    read_marks,
+    read_measurements,
+    without_frozen,
+)
 from pipeline.poses_table import Poses, read_poses
 from pipeline.robot_import import read_any_robot
 from pipeline.schemas import parse, proposal
@@ -252,7 +259,9 @@ class _Reader:
         if start is not None:
             size = (start.camera.width, start.camera.height)
         if entry.observations is not None:
-            return ImageSource({}, read_marks(self._file(entry.observations)), start, start_path, size)
+            marks = read_marks(self._file(entry.observations))
+            check_marks(marks, size)
+            return ImageSource({}, marks, start, start_path, size)
         folder = self._place(str(entry.images)).absolute()  # the report looks for them from anywhere
         return ImageSource(list_images(folder, what), None, start, start_path, size)
 
