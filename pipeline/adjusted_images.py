@@ -7,19 +7,14 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from pipeline import artifacts
 from pipeline.bodies import surveyed_or_given
 from pipeline.campaign import Campaign
 from pipeline.runs import Run
 from pipeline.tables import read_table
-from robcal.photogrammetry.survey.types import SurveyResult
 from robcal.recipe.image_findings import ImageFindings, StationResult, SurveyImages, image_findings
 from robcal.recipe.station import StationImages
 from robcal.transforms import Array
-
-SHAPES = "shapes"
-"""Artifact of the station: ellipses and light of its identified marks."""
-CORRECTED_IMAGES = "corrected_images"
-"""Artifact of the station: findings that it was oriented without (sizes of dots, centres that trail behind light)."""
 
 
 def findings_of(campaign: Campaign, run: Run) -> ImageFindings:
@@ -29,12 +24,10 @@ def findings_of(campaign: Campaign, run: Run) -> ImageFindings:
 
 def _surveys(campaign: Campaign, run: Run) -> list[SurveyImages]:
     found: list[SurveyImages] = []
-    if run.record("survey") is None:
-        return found
     for name, source in campaign.bodies.items():
-        if source.survey is None or not run.has(f"survey_{name}"):
+        result = run.find(artifacts.survey(name))
+        if source.survey is None or result is None:
             continue
-        result: SurveyResult = run.load(f"survey_{name}")
         start, path = source.survey.start, source.survey.start_path
         camera = path.stem if path is not None else f"survey_{name}"
         dots = any(target.code != "corner" for target in source.file.targets)
@@ -43,18 +36,19 @@ def _surveys(campaign: Campaign, run: Run) -> list[SurveyImages]:
 
 
 def _station(campaign: Campaign, run: Run) -> StationResult | None:
-    if run.record("orient") is None or not run.has("orient"):
+    orientation = run.find(artifacts.ORIENTATION)
+    if orientation is None:
         return None
-    orientation = run.load("orient")
     images = StationImages(
         poses=campaign.poses.names if campaign.poses is not None else (),
         body=surveyed_or_given(campaign, run, orientation.body.name),
-        marks=run.load("marks"),
-        shapes=run.load(SHAPES) if run.has(SHAPES) else {},
+        marks=run.load(artifacts.MARKS),
+        shapes=run.load(artifacts.SHAPES),
         start={name: s.start.camera if s.start else None for name, s in campaign.cameras.items()},
         covariates=image_covariates(campaign),
     )
-    return StationResult(images, orientation, tuple(run.load(CORRECTED_IMAGES)) if run.has(CORRECTED_IMAGES) else ())
+    corrected = run.load(artifacts.CORRECTED_IMAGES)
+    return StationResult(images, orientation, tuple(corrected))
 
 
 def image_covariates(campaign: Campaign) -> Mapping[str, Array]:

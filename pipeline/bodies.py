@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from pipeline.artifacts import FRAMES, surveyed_body
 from pipeline.body_file import BodyFile
 from pipeline.campaign import Campaign
 from pipeline.runs import Run
@@ -41,16 +42,15 @@ def body_from_file(name: str, file: BodyFile) -> Body:
 
 def surveyed_or_given(campaign: Campaign, run: Run, name: str) -> Body:
     """A body with the coordinates of its survey if that was done, else those of its file."""
-    if campaign.bodies[name].survey is not None and run.record("survey") is not None and run.has(f"body_{name}"):
-        found: Body = run.load(f"body_{name}")
-        return found
-    return body_from_file(name, campaign.bodies[name].file)
+    body = campaign.bodies[name]
+    found = run.find(surveyed_body(name)) if body.survey is not None else None
+    return found if found is not None else body_from_file(name, body.file)
 
 
 def body_for_robot(campaign: Campaign, run: Run) -> Body | None:
     """The body that the robot carries (or its sensor looks at), as the frames were made with it."""
-    if run.record("frames") is not None and run.has("body_used"):
-        found: Body | None = run.load("body_used")
-        return found
+    frames = run.find(FRAMES)
+    if frames is not None:
+        return frames.body
     name = campaign.carried_body
     return surveyed_or_given(campaign, run, name) if name is not None else None

@@ -11,17 +11,20 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from filelock import FileLock, Timeout
 
 from pipeline import codec
+from pipeline.artifacts import Artifact
 from pipeline.files import sha256_of, storage_error
 from pipeline.json_io import read_json, write_json
 from robcal.errors import InvalidInput, RobcalError
 
 RECORD_FORMAT = "robcal/stage-record-1"
 RUN_FORMAT = "robcal/run-1"
+
+T = TypeVar("T")
 
 
 class RunLocked(RobcalError):
@@ -135,27 +138,30 @@ class Run:
         """Folder of a survey's network in COLMAP's text format."""
         return self.folder / "colmap" / _plain(name)
 
-    def cache(self, name: str) -> Path:
+    def artifact(self, artifact: Artifact[Any]) -> Path:
         """cache/<name>.npz: a stage's typed result."""
-        return self.folder / "cache" / f"{name}.npz"
+        return self.folder / "cache" / f"{artifact.name}.npz"
 
-    def detections(self, key: str) -> Path:
-        """cache/detections/<key>.npz: targets found in one image."""
-        return self.folder / "cache" / "detections" / f"{key}.npz"
-
-    def save(self, name: str, value: object) -> Path:
-        """Store a typed result under a name; returns its path."""
-        path = self.cache(name)
+    def save(self, artifact: Artifact[T], value: T) -> Path:
+        """Store a typed result; returns its path."""
+        path = self.artifact(artifact)
         codec.save(path, value)
         return path
 
-    def load(self, name: str) -> Any:
-        """A typed result stored by :meth:`save`."""
-        return codec.load(self.cache(name))
+    def load(self, artifact: Artifact[T]) -> T:
+        """A typed result stored by :meth:`save`.
 
-    def has(self, name: str) -> bool:
-        """Whether a typed result of this name is stored."""
-        return self.cache(name).is_file()
+        Raises
+        ------
+        InvalidInput : it is not there. StaleCache : it is damaged or of another version of the program.
+        """
+        found: T = codec.load(self.artifact(artifact))
+        return found
+
+    def find(self, artifact: Artifact[T]) -> T | None:
+        """A typed result, None where its stage is not done or left none."""
+        made = self.record(artifact.stage) is not None and self.artifact(artifact).is_file()
+        return self.load(artifact) if made else None
 
     def record_path(self, stage: str) -> Path:
         """state/<stage>.json"""

@@ -130,13 +130,14 @@ def own_gain(root: Path, truth: OwnTruth) -> dict[str, Any]:
 
     The last one at the level of marks, with the noise that the plan states.
     """
+    from pipeline.artifacts import CALIBRATED
     from pipeline.runner import run_campaign
     from pipeline.runs import Run
 
     run, table = Run(root / "run"), root / "campaign" / "kept_out.csv"
     true = kept_out_frames(truth) @ true_T_surveyed(truth, root / "run" / "bodies" / "plate.yaml")
     out = {"before_inside": tip_error_mm(_predicted(_fitted(root / "campaign", run), table), true)}
-    out["after_inside"] = tip_error_mm(_predicted(run.load("calibrated"), table), true)
+    out["after_inside"] = tip_error_mm(_predicted(run.load(CALIBRATED), table), true)
     plan = {name: value for name, value in vars(truth.plan).items() if name != "effects"}
     healthy = make_own(root / "healthy", effects=(), **plan)
     run_campaign(root / "healthy", root / "healthy_run", until="identify")
@@ -159,9 +160,10 @@ def true_T_surveyed(truth: OwnTruth, surveyed: Path) -> Array:
 
 def _fitted(folder: Path, run: Any) -> Any:
     """The identified robot fitted once more beside the errors of its station, without any further physics."""
+    from pipeline.artifacts import IDENTIFICATION, ORIENTATION, POINTS
     from pipeline.bodies import body_for_robot
     from pipeline.campaign import read_campaign
-    from pipeline.stages.identify import load_identification, require_robot
+    from pipeline.stages.identify import require_robot
     from robcal.calibration.calibrated import with_folded_cell
     from robcal.diagnosis.core.fitting import fit
     from robcal.recipe.recording import recording_for_diagnosis
@@ -169,8 +171,8 @@ def _fitted(folder: Path, run: Any) -> Any:
 
     campaign = read_campaign(folder)
     _, poses = require_robot(campaign)
-    found = load_identification(run)
-    body, points, station = body_for_robot(campaign, run), run.load("points"), run.load("orient")
+    found = run.load(IDENTIFICATION)
+    body, points, station = body_for_robot(campaign, run), run.load(POINTS), run.load(ORIENTATION)
     recording = recording_for_diagnosis(poses, found.recording, found.rows, body, points, station)
     robot = found.robot
     model = fit(robot.model, recording, (*robot.names, *own_elasticities(robot))).model

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.artifacts import detections
 from pipeline.images import read_image
 from pipeline.report.blocks import Block, Chapter, Figure, Picture, Pictures, table
 from pipeline.report.material import Material
@@ -86,7 +87,7 @@ def _picture(material: Material, entry: object, why: str) -> Picture | None:
         return None
     try:
         grey = read_image(path)
-        found: Detections = material.run.load(f"detections/{key}")
+        found = material.run.load(detections(key))
     except (RobcalError, OSError):
         return None
     jpeg, width, height = drawn(grey, found)

@@ -5,19 +5,28 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
+from pipeline import artifacts
+from pipeline.artifacts import Artifact
 from pipeline.campaign import Campaign, read_campaign
 from pipeline.codec import StaleCache
 from pipeline.json_io import read_json
 from pipeline.runs import Run, campaign_of, run_file
+from pipeline.stages.detect import DetectionIndex
 from pipeline.stages.registry import STAGES
+from robcal.calibration.calibrated import CalibratedRobot
+from robcal.calibration.measurements import Rows
 from robcal.calibration.verification import Verification
 from robcal.errors import RobcalError
 from robcal.photogrammetry.measure.frames import MeasuredFrames
 from robcal.photogrammetry.measure.measured_points import MeasuredPoints
 from robcal.photogrammetry.station.network import StationOrientation
 from robcal.photogrammetry.survey.types import SurveyResult
+from robcal.recipe.evidence import Evidence
+from robcal.recipe.identification import Identification
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -74,12 +83,10 @@ class Material:
         """Seconds by stage."""
         return {name: record.seconds for name in self.stages if (record := self.run.record(name)) is not None}
 
-    def artifact(self, name: str, stage: str) -> Any:
+    def find(self, artifact: Artifact[T]) -> T | None:
         """A stage's stored result, None if the stage did not run or its result is of another version."""
-        if stage not in self.stages or not self.run.has(name):
-            return None
         try:
-            return self.run.load(name)
+            return self.run.find(artifact) if artifact.stage in self.stages else None
         except StaleCache:
             return None
 
@@ -91,52 +98,52 @@ class Material:
         return read_json(self.run.diagnosis)
 
     @cached_property
-    def detections(self) -> Any:
+    def detections(self) -> DetectionIndex | None:
         """Index of the images."""
-        return self.artifact("detect", "detect")
+        return self.find(artifacts.DETECTED)
 
     @cached_property
     def surveys(self) -> dict[str, SurveyResult]:
         """Surveyed bodies by name."""
         names = self.result.get("survey", {})
-        found = {name: self.artifact(f"survey_{name}", "survey") for name in names}
+        found = {name: self.find(artifacts.survey(name)) for name in names}
         return {name: result for name, result in found.items() if result is not None}
 
     @cached_property
     def station(self) -> StationOrientation | None:
         """The oriented station."""
-        return self.artifact("orient", "orient")
+        return self.find(artifacts.ORIENTATION)
 
     @cached_property
     def points(self) -> MeasuredPoints | None:
         """Measured points."""
-        return self.artifact("points", "measure")
+        return self.find(artifacts.POINTS)
 
     @cached_property
     def frames(self) -> MeasuredFrames | None:
         """Measured frames."""
-        return self.artifact("frames", "frames")
+        return self.find(artifacts.FRAMES)
 
     @cached_property
-    def identification(self) -> Any:
+    def identification(self) -> Identification | None:
         """Result of the stage identify."""
-        return self.artifact("identify", "identify")
+        return self.find(artifacts.IDENTIFICATION)
 
     @cached_property
-    def calibrated(self) -> Any:
+    def calibrated(self) -> CalibratedRobot | None:
         """The calibrated robot with what the diagnosis added."""
-        found = self.artifact("calibrated", "diagnose")
+        found = self.find(artifacts.CALIBRATED)
         return found if found is not None or self.identification is None else self.identification.robot
 
     @cached_property
-    def verification(self) -> tuple[Verification, Any] | None:
+    def verification(self) -> tuple[Verification, Rows] | None:
         """Verification and the rows of its poses."""
-        return self.artifact("verify", "verify")
+        return self.find(artifacts.VERIFICATION)
 
     @cached_property
-    def evidence(self) -> Any:
+    def evidence(self) -> Evidence | None:
         """Plots of the diagnosis, as numbers."""
-        return self.artifact("evidence", "diagnose") or ()
+        return self.find(artifacts.EVIDENCE)
 
     @cached_property
     def pose_names(self) -> tuple[str, ...]:

@@ -19,6 +19,8 @@ _AXIS = {"x": 0, "y": 1, "z": 2}
 def robot_figure(material: Material, causes: list[dict[str, Any]]) -> Figure | None:
     """The robot in the recorded pose that carries most of what was found; None where no place is on it."""
     calibrated = material.calibrated
+    if calibrated is None or calibrated.q is None:
+        return None
     model: RobotModel = calibrated.model
     chain = chain_of(model)
     row, pose = _pose(material, causes)

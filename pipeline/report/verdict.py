@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.artifacts import CORRECTED
 from pipeline.report.blocks import Grade, KeyFigure, Verdict
 from pipeline.report.diagnosis_chapter import short_statement
 from pipeline.report.material import Material
@@ -107,7 +108,7 @@ def _taken_out(material: Material, v: Verification) -> str:
     Errors that all poses share (place and lens of the cameras, coordinates of the body) do not show in the comparison;
     the predicted standard deviation holds them.
     """
-    freed = material.artifact("corrected", "diagnose")
+    freed = material.find(CORRECTED)
     if freed is None or material.identification is None:
         return ""
     shifts = [

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from pipeline import codec
+from pipeline.artifacts import DETECTED, detections
 from pipeline.body_file import BodyFile
 from pipeline.campaign import Campaign, ImageSource
 from pipeline.campaign_schema import SurveyEntry
@@ -35,6 +36,7 @@ class ImageEntry:
     ----------
     source : ``survey/<body>`` or ``station/<camera>``; name : image name (for a station the pose id).
     key : name of its detections in the cache, None if it could not be read; size : (width, height).
+    contradicted : targets whose contour has another centre than the fit to their grey values.
     message : why there is nothing in it, or why it could not be read.
     """
 
@@ -47,6 +49,7 @@ class ImageEntry:
     codes: int
     saturated: int
     message: str = ""
+    contradicted: int = 0
 
 
 @dataclass(frozen=True)
@@ -130,7 +133,10 @@ def _detect(job: _Job) -> ImageEntry:
     height, width = found.shape
     read = int((found.code >= 0).sum())
     lit = int(found.saturated.sum())
-    return ImageEntry(job.source, job.name, job.path, job.key, (width, height), len(found), read, lit, found.message)
+    doubtful = int(found.contradicted.sum())
+    return ImageEntry(
+        job.source, job.name, job.path, job.key, (width, height), len(found), read, lit, found.message, doubtful
+    )
 
 
 def work(context: Context) -> Outcome:
@@ -145,13 +151,13 @@ def work(context: Context) -> Outcome:
             content = run.hash(path)
             _refuse_duplicate(hashes.setdefault(source, {}), content, path)
             key = fingerprint(content, codec.encode(settings, {}), version)[:32]
-            jobs.append(_Job(source, name, path, str(run.detections(key)), key, settings))
+            jobs.append(_Job(source, name, path, str(run.artifact(detections(key))), key, settings))
     results = in_processes(_detect, jobs, context.workers)
     entries = list(track(results, len(jobs), "detecting targets"))
     _refuse_unreadable(entries)
     notes = [note for source, (images, _, _) in sources(campaign).items() for note in _check(source, images, entries)]
     index = DetectionIndex(tuple(entries))
-    path = run.save(NAME, index)
+    path = run.save(DETECTED, index)
     result = {
         "images": len(entries),
         "targets": sum(e.targets for e in entries),
@@ -194,12 +200,19 @@ def _check(source: str, images: ImageSource, entries: Sequence[ImageEntry]) -> l
             f"{own[0].path.parent}: no targets found in any of {len(own)} images{told}: check exposure, focus and that "
             "these are images of the body (bright dots on dark ground unless 'polarity: dark')"
         )
-    return [f"{entry.path}: {entry.message or 'no targets found'}: the image is left out" for entry in empty]
+    notes = [f"{entry.path}: {entry.message or 'no targets found'}: the image is left out" for entry in empty]
+    if doubtful := [entry for entry in own if entry.contradicted]:
+        total, worst = sum(e.contradicted for e in doubtful), max(doubtful, key=lambda e: e.contradicted)
+        notes.append(
+            f"{source}: {total} dots in {len(doubtful)} of {len(own)} images have a contour with another centre than "
+            f"their grey values (dirt, reflections, half covered?), most in {worst.path.name}"
+        )
+    return notes
 
 
 def load_detections(run: Run, index: DetectionIndex, source: str) -> dict[str, Detections]:
     """Image name -> targets of one source, images without targets left out."""
-    return {e.name: codec.load(run.detections(e.key)) for e in index.of(source) if e.key is not None and e.targets}
+    return {e.name: run.load(detections(e.key)) for e in index.of(source) if e.key is not None and e.targets}
 
 
 def sizes(index: DetectionIndex, source: str) -> tuple[int, int]:

@@ -6,20 +6,18 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
+from pipeline import artifacts
 from pipeline.adjusted_images import findings_of
 from pipeline.bodies import body_for_robot
 from pipeline.campaign import Campaign
 from pipeline.json_io import write_json
 from pipeline.messages import LOG
-from pipeline.runs import Run
 from pipeline.stages.base import Context, Outcome, Stage, no_files
-from pipeline.stages.identify import load_identification
 from pipeline.tables import write_table
 from robcal.diagnosis.content import diagnosis_content, with_images
 from robcal.diagnosis.core.result import Diagnosis
 from robcal.diagnosis.images.diagnosis import ImageFinding
 from robcal.diagnosis.search.selection import SelectionSettings
-from robcal.photogrammetry.station.network import StationOrientation
 from robcal.recipe.robot_diagnosis import Measured, diagnose_robot
 from robcal.recipe.robot_witness import with_station_moves
 
@@ -36,9 +34,9 @@ def work(context: Context) -> Outcome:
         told = [str(finding.statement) for finding in images.findings] or [str(content["statement"])]
         result = {"mismatch": content["mismatch"], "p_value": content["p_value"], "causes": _named(images.findings)}
         return Outcome({"diagnosis": result | {"heldout_px": content["heldout_px"]}}, [run.diagnosis], told)
-    station = _own_station(run)
-    measured = Measured(body_for_robot(campaign, run), run.load("points") if run.has("points") else None, station)
-    identification = load_identification(run)
+    station = run.find(artifacts.ORIENTATION)  # None where another system measured
+    measured = Measured(body_for_robot(campaign, run), run.find(artifacts.POINTS), station)
+    identification = run.load(artifacts.IDENTIFICATION)
     found = diagnose_robot(identification, campaign.poses, measured, images, settings_of(campaign), LOG.info)
     if found is None:
         return Outcome(notes=["nothing to diagnose"])
@@ -47,14 +45,14 @@ def work(context: Context) -> Outcome:
     if station is not None and found.recording.own_station:
         content = with_station_moves(content, station.names, found.recording, diagnosis.model)
     write_json(run.diagnosis, content)
-    outputs = [run.diagnosis, run.save("calibrated", found.robot), run.save("evidence", found.evidence)]
+    outputs = [run.diagnosis, run.save(artifacts.CALIBRATED, found.robot), run.save(artifacts.EVIDENCE, found.evidence)]
     if content.get("next_poses"):
         write_table(run.next_poses, _columns(content["next_poses"]))
         outputs.append(run.next_poses)
     if found.relative is not None:
-        outputs.append(run.save("relative", found.relative))
+        outputs.append(run.save(artifacts.RELATIVE_COVARIANCE, found.relative))
     if found.corrected is not None:
-        outputs.append(run.save("corrected", found.corrected))
+        outputs.append(run.save(artifacts.CORRECTED, found.corrected))
     told = [f.statement for f in images.findings] + [f.statement for f in diagnosis.findings]
     notes = told or ["nothing missing: the model explains the data"]
     outcome = _result(diagnosis) | {"mismatch": content["mismatch"]}
@@ -65,14 +63,6 @@ def work(context: Context) -> Outcome:
 def settings_of(campaign: Campaign) -> SelectionSettings:
     """Settings of the diagnosis from campaign.yaml."""
     return dataclasses.replace(SelectionSettings(), level=campaign.entry.diagnosis.level)
-
-
-def _own_station(run: Run) -> StationOrientation | None:
-    """The station whose frames are diagnosed; None where another system measured."""
-    if run.record("orient") is None or not run.has("orient"):
-        return None
-    found: StationOrientation = run.load("orient")
-    return found
 
 
 def _columns(rows: Any) -> dict[str, list[object]]:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.artifacts import FRAMES, ORIENTATION, POINTS
 from pipeline.bodies import surveyed_or_given
 from pipeline.campaign import Campaign
 from pipeline.frame_tables import frame_columns, frame_covariance_columns, six_covariance
@@ -37,13 +38,13 @@ def work(context: Context) -> Outcome:
     campaign, run = context.campaign, context.run
     if campaign.poses is None:
         raise InvalidInput(f"{campaign.path}: no poses: add 'poses: poses.csv'")
-    points: MeasuredPoints = run.load("points")
+    points = run.load(POINTS)
     body = _body(campaign, run)
     _check_points(campaign, points, body)
     tolerance = campaign.entry.quality.distance_tolerance_mm
     frames = measure_frames(points, body, tolerance=None if tolerance is None else tolerance / 1000)
     write_frames(run, campaign.poses, frames)
-    outputs = [run.save(NAME, frames), run.save("body_used", frames.body), run.frames]
+    outputs = [run.save(FRAMES, frames), run.frames]
     names = campaign.poses.names
     notes = [*frames.notes, *(f"pose '{names[r.pose]}' rejected: {r.reason}" for r in frames.rejected_poses)]
     if frames.recurring.pairs or frames.recurring.scale_ppm is not None:
@@ -82,10 +83,8 @@ def _body(campaign: Campaign, run: Run) -> Body | None:
     name = campaign.carried_body
     if name is None:
         return None
-    if run.record("orient") is not None and run.has("orient"):
-        oriented: Body = run.load("orient").body
-        return oriented
-    return surveyed_or_given(campaign, run, name)
+    orientation = run.find(ORIENTATION)
+    return orientation.body if orientation is not None else surveyed_or_given(campaign, run, name)
 
 
 def write_frames(run: Run, poses: Poses, frames: MeasuredFrames) -> None:

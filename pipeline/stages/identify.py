@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.artifacts import CALIBRATED, IDENTIFICATION
 from pipeline.bodies import body_for_robot
 from pipeline.campaign import Campaign
 from pipeline.poses_table import Poses
@@ -21,7 +22,7 @@ from robcal.calibration.recording_faults import fault_of
 from robcal.calibration.slips import mirror_misses
 from robcal.errors import InvalidInput, RobcalError
 from robcal.photogrammetry.survey.given_coordinates import GivenCoordinates
-from robcal.recipe.identification import Identification, identify_robot
+from robcal.recipe.identification import identify_robot
 from robcal.robot.kernel import Kernel
 from robcal.robot.model import RobotModel
 
@@ -55,7 +56,7 @@ def work(context: Context) -> Outcome:
         found = identify_robot(robot, poses, recording, options_of(campaign, recording.stated))
     except InvalidInput as error:
         raise located(error, str(poses.path)) from None
-    outputs = [run.save(NAME, found)]
+    outputs = [run.save(IDENTIFICATION, found)]
     write_robot(run.robot, found.robot.model, f"calibrated from campaign {campaign.name}, before the diagnosis")
     notes = [*found.recording.notes, *_notes(found.robot, poses, found.rows)]
     return Outcome({"identification": _result(found.robot, found.rows)}, outputs, notes)
@@ -151,12 +152,6 @@ def _notes(found: IdentifiedRobot, poses: Poses, rows: Rows) -> list[str]:
     return notes
 
 
-def load_identification(run: Run) -> Identification:
-    """Result of the stage."""
-    found: Identification = run.load(NAME)
-    return found
-
-
 def load_calibrated(run: Run) -> CalibratedRobot:
     """The robot with all that was found out about it: after the diagnosis where there was one.
 
@@ -164,11 +159,12 @@ def load_calibrated(run: Run) -> CalibratedRobot:
     ------
     InvalidInput : the run has no calibrated robot.
     """
-    if run.record("diagnose") is not None and run.has("calibrated"):
-        found: CalibratedRobot = run.load("calibrated")
+    found = run.find(CALIBRATED)
+    if found is not None:
         return found
-    if run.record(NAME) is not None and run.has(NAME):
-        return load_identification(run).robot
+    identified = run.find(IDENTIFICATION)
+    if identified is not None:
+        return identified.robot
     raise InvalidInput(f"{run.folder}: holds no calibrated robot: the campaign needs a robot, poses and measurements")
 
 

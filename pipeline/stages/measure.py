@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from pipeline.artifacts import POINTS
 from pipeline.campaign import Campaign
 from pipeline.poses_table import Poses
 from pipeline.runs import Run
@@ -33,7 +34,7 @@ def work(context: Context) -> Outcome:
     if points.resected is not None and len(points.resected.pose):
         notes.append(f"{len(points.resected.pose)} poses by resection from one camera")
     result = {"measured": len(points.pose), "rejected": len(points.rejected)}
-    return Outcome({"points": result}, [run.save("points", points), run.points], notes)
+    return Outcome({"points": result}, [run.save(POINTS, points), run.points], notes)
 
 
 def points_from_tables(campaign: Campaign) -> MeasuredPoints:

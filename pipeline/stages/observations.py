@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from pipeline.artifacts import FRAMES, POINTS
 from pipeline.campaign import Campaign
 from pipeline.measurement_tables import MeasuredTable
 from pipeline.runs import Run
@@ -22,8 +23,6 @@ from robcal.calibration.observations import (
 )
 from robcal.errors import InvalidInput
 from robcal.photogrammetry.core.bodies import Body
-from robcal.photogrammetry.measure.frames import MeasuredFrames
-from robcal.photogrammetry.measure.measured_points import MeasuredPoints
 from robcal.transforms import Array
 
 
@@ -38,9 +37,9 @@ def build_recording(campaign: Campaign, run: Run, body: Body | None) -> RobotRec
     detailed: list[RobotObservations] = []
     stated = True
     notes: list[str] = []
-    if run.record("frames") is not None and run.has("frames"):
-        frames: MeasuredFrames = run.load("frames")
-        points: MeasuredPoints = run.load("points")
+    frames = run.find(FRAMES)
+    if frames is not None:
+        points = run.load(POINTS)
         stated &= points.covariance is not None
         if len(frames.pose):
             observations.append(frame_observations(points, frames))
@@ -51,7 +50,7 @@ def build_recording(campaign: Campaign, run: Run, body: Body | None) -> RobotRec
             else:
                 detailed.append(used_points(points, frames, body) or observations[-1])
     for table in campaign.measurements:
-        if table.kind == "points" and observations and run.has("frames"):
+        if table.kind == "points" and frames is not None:
             continue
         made = _from_table(table, campaign, body)
         stated &= table.covariance is not None

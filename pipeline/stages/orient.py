@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.adjusted_images import CORRECTED_IMAGES, SHAPES, image_covariates
+from pipeline.adjusted_images import image_covariates
+from pipeline.artifacts import CORRECTED_IMAGES, DETECTED, MARKS, ORIENTATION, SHAPES
 from pipeline.bodies import surveyed_or_given
 from pipeline.camera_file import CameraFile, write_camera
 from pipeline.campaign import Campaign, ImageSource
@@ -18,7 +19,7 @@ from pipeline.measurement_tables import MarksTable
 from pipeline.poses_table import Poses
 from pipeline.runs import Run
 from pipeline.stages.base import Context, Outcome, Stage
-from pipeline.stages.detect import DetectionIndex, load_detections
+from pipeline.stages.detect import load_detections
 from pipeline.stages.identify import options_of
 from pipeline.stages.survey import located, size_of_marks
 from robcal.errors import InvalidInput, RobcalError
@@ -72,7 +73,7 @@ def work(context: Context) -> Outcome:
     except RobcalError as error:
         raise located(error, f"{campaign.path}: station") from None
     orientation, marks = found.orientation, dict(found.marks)
-    outputs = [run.save(NAME, orientation), run.save("marks", dict(marks))]
+    outputs = [run.save(ORIENTATION, orientation), run.save(MARKS, marks)]
     outputs += [run.save(CORRECTED_IMAGES, list(found.corrected)), run.save(SHAPES, dict(images.shapes))]
     outputs += _write_cameras(campaign, run, orientation)
     notes += [f.statement for f in found.corrected] + [e.statement for e in orientation.evidence]
@@ -96,7 +97,7 @@ def _detections(campaign: Campaign, run: Run, poses: Poses) -> dict[str, dict[in
     if not any(source.images for source in campaign.cameras.values()):
         return {}
     place = {name: i for i, name in enumerate(poses.names)}
-    index: DetectionIndex = run.load("detect")
+    index = run.load(DETECTED)
     return {
         name: {place[image]: found for image, found in load_detections(run, index, f"station/{name}").items()}
         for name, source in campaign.cameras.items()
@@ -162,7 +163,7 @@ def _problem_notes(problems: tuple[tuple[str, int, str], ...], poses: Poses) -> 
 def _size(source: ImageSource, run: Run, name: str) -> tuple[int, int]:
     if source.marks is not None:
         return source.size or size_of_marks(source.marks)
-    index: DetectionIndex = run.load("detect")
+    index = run.load(DETECTED)
     return index.of(f"station/{name}")[0].size
 
 
@@ -207,8 +208,8 @@ def _result(orientation: StationOrientation, marks: Mapping[str, StationMarks]) 
 
 def station_points(run: Run) -> MeasuredPoints:
     """Targets in the world from the oriented station and all identified marks."""
-    orientation: StationOrientation = run.load(NAME)
-    marks: dict[str, StationMarks] = run.load("marks")
+    orientation = run.load(ORIENTATION)
+    marks = run.load(MARKS)
     return measure_points(orientation, marks)
 
 

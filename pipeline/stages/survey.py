@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from pipeline import artifacts
 from pipeline.body_file import BodyFile, write_body
 from pipeline.camera_file import CameraFile, write_camera
 from pipeline.campaign import BodySource, Campaign, ImageSource
@@ -15,7 +16,7 @@ from pipeline.campaign_schema import CheckLengthEntry, FixedDatum, ScaleBarEntry
 from pipeline.measurement_tables import MarksTable
 from pipeline.runs import Run
 from pipeline.stages.base import Context, Outcome, Stage
-from pipeline.stages.detect import DetectionIndex, load_detections, sizes
+from pipeline.stages.detect import load_detections, sizes
 from robcal.errors import DegenerateGeometry, InvalidInput, NotIdentifiable, RobcalError
 from robcal.photogrammetry.bundle.colmap_engine import export_colmap
 from robcal.photogrammetry.core.bodies import Body
@@ -36,7 +37,7 @@ def work(context: Context) -> Outcome:
             continue
         done = survey_one(campaign, run, name, source)
         body = surveyed_body(name, source.file, done, _not_on_it(campaign, run, name, source))
-        outputs += [run.save(f"survey_{name}", done), run.save(f"body_{name}", body)]
+        outputs += [run.save(artifacts.survey(name), done), run.save(artifacts.surveyed_body(name), body)]
         outputs += _write(run, name, source.survey, body, done)
         notes += [f"survey of '{name}': {note}" for note in _notes(done)]
         doubts = _against_given(campaign, source, done)
@@ -137,7 +138,7 @@ def _check_lengths(campaign: Campaign, name: str, entry: SurveyEntry) -> None:
 def _images(run: Run, name: str, source: ImageSource, file: BodyFile) -> tuple[list[SurveyImage], tuple[int, int]]:
     if source.marks is not None:
         return marks_by_image(source.marks), source.size or size_of_marks(source.marks)
-    index: DetectionIndex = run.load("detect")
+    index = run.load(artifacts.DETECTED)
     key = f"survey/{name}"
     found = load_detections(run, index, key)
     return [SurveyImage(image, detections=targets) for image, targets in found.items()], sizes(index, key)
@@ -180,7 +181,7 @@ def _not_on_it(campaign: Campaign, run: Run, name: str, source: BodySource) -> f
     bare = ends & {t.id for t in source.file.targets if t.id is not None and t.xyz is None}
     seen: Counter[int] = Counter()
     if bare and any(camera.images for camera in campaign.cameras.values()):
-        index: DetectionIndex = run.load("detect")
+        index = run.load(artifacts.DETECTED)
         for camera in campaign.cameras:
             for found in load_detections(run, index, f"station/{camera}").values():
                 seen.update(set(found.code.tolist()))

@@ -7,16 +7,17 @@ from typing import Any
 
 import numpy as np
 
+from pipeline import artifacts
 from pipeline.codec import save_arrays
 from pipeline.json_io import read_json
 from pipeline.poses_table import Poses
 from pipeline.robot_file import write_robot
 from pipeline.runs import Run
 from pipeline.stages.base import Context, Outcome, Stage, no_files
-from pipeline.stages.identify import load_calibrated, load_identification, options_of, require_robot
+from pipeline.stages.identify import load_calibrated, options_of, require_robot
 from pipeline.tables import write_table
 from robcal.calibration.calibrated import CalibratedRobot
-from robcal.calibration.measurements import RobotObservations, RobotRecording, Rows
+from robcal.calibration.measurements import RobotObservations
 from robcal.calibration.observations import (
     DistanceObservations,
     FrameObservations,
@@ -36,20 +37,17 @@ def work(context: Context) -> Outcome:
     """Verify on the kept-out poses, or by folds where there are none; write the calibrated robot."""
     campaign, run = context.campaign, context.run
     robot, poses = require_robot(campaign)
-    identification = load_identification(run)
+    identification = run.load(artifacts.IDENTIFICATION)
     calibrated = load_calibrated(run)
     # what the diagnosis found in the measuring system is no error of the robot
-    freed: RobotRecording | None = None
-    relative = None
-    if run.record("diagnose") is not None and run.has("corrected"):
-        freed = run.load("corrected")
-        relative = run.load("relative") if run.has("relative") else None
+    freed = run.find(artifacts.CORRECTED)
+    relative = run.find(artifacts.RELATIVE_COVARIANCE) if freed is not None else None
     options = options_of(campaign, identification.recording.stated)
     outcome, tested, notes = verify_robot(robot, identification, calibrated, poses, options, freed, relative)
     write_robot(run.robot, calibrated.model, f"calibrated from campaign {campaign.name}")
     _write_covariance(run, calibrated)
     _write_residuals(run, poses, calibrated, (freed or identification.recording).observations)
-    outputs = [run.save(NAME, (outcome, tested)), run.robot, run.covariance, run.residuals]
+    outputs = [run.save(artifacts.VERIFICATION, (outcome, tested)), run.robot, run.covariance, run.residuals]
     diagnosis = read_json(run.diagnosis) if run.record("diagnose") is not None and run.diagnosis.is_file() else None
     facts = robot_facts(identification, calibrated, poses, outcome, diagnosis, doubtful_coordinates(run))
     found = verdict(facts)
@@ -130,12 +128,6 @@ def _result(outcome: Verification) -> dict[str, Any]:
             "groups": outcome.iso.groups,
         }
     return result
-
-
-def load_verification(run: Run) -> tuple[Verification, Rows]:
-    """Result of the stage and the rows of the poses it was made on."""
-    found: tuple[Verification, Rows] = run.load(NAME)
-    return found
 
 
 STAGE = Stage(

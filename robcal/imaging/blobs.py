@@ -14,7 +14,7 @@ from robcal.imaging.settings import DetectionSettings
 Array = NDArray[np.float64]
 
 
-_ROUGH_PIXELS = 40_000  # pixels of a part that are enough to tell its noise
+_ROUGH_PIXELS = 40_000  # pixels of a part that are enough to estimate its noise
 
 
 @dataclass(frozen=True)
@@ -115,7 +115,8 @@ def step_all_around(image: NDArray, candidates: Candidates) -> tuple[Array, NDAr
     """Step of grey values across the outline, (n,), and whether it is there in nearly every direction and about equal.
 
     A cheap test before the fit: parts of textures, corners and arcs fail it, dots beside others do not. The step is
-    the median over all directions: what surrounds a blob tells its contrast better than the coarse background does.
+    the median over all directions: the surroundings of a blob determine its contrast better than the coarse
+    background does.
     """
     n = len(candidates)
     if n == 0:

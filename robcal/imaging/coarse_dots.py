@@ -3,7 +3,7 @@
 Drilled holes, balls lit from the side, dots seen through water: their outline is round, their brightness is not even,
 and the strict fit of :mod:`robcal.imaging.detect` refuses them. Extrema of the scale-normalised Laplacian of Gaussian
 (Lindeberg 1998, "Feature detection with automatic scale selection") find them at a fraction of their radius, which is
-enough to identify them by geometry; their covariance says so.
+enough to identify them by geometry; their covariance is stated accordingly.
 """
 
 from __future__ import annotations

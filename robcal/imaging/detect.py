@@ -14,6 +14,7 @@ from robcal.imaging.coarse_dots import with_coarse_dots
 from robcal.imaging.detections import CodeState, Detections, Reason, RejectionLog, TargetKind, empty_columns
 from robcal.imaging.dot_fitting import FittedDots, blur_without_pixel, fit_dots, refit_ringed
 from robcal.imaging.noise import NoiseModel, estimate_noise
+from robcal.imaging.other_centroids import contour_centres
 from robcal.imaging.ring_code import RingReadings, read_rings
 from robcal.imaging.segmentation import find_candidates
 from robcal.imaging.selection import accept, may_be_ring_parts, without_duplicates, without_ring_parts
@@ -21,6 +22,8 @@ from robcal.imaging.settings import DetectionSettings
 
 Array = NDArray[np.float64]
 
+_DOUBTFUL = 0.2
+"""Share of the largest misfit of an accepted dot (clean ones stay below) above which its contour is examined."""
 _DEFAULT = DetectionSettings()
 _ODD = (Reason.SHAPE, Reason.STRUCTURE, Reason.NO_CONVERGENCE, Reason.OVER_CAP)
 _CODED_MISFIT_MAX = 0.1
@@ -32,7 +35,7 @@ def detect_targets(image: NDArray, settings: DetectionSettings = _DEFAULT) -> De
 
     Parameters
     ----------
-    image : (h, w) uint8 or uint16; not changed. settings : what to look for.
+    image : (h, w) uint8 or uint16; not changed. settings : of the detection.
 
     Returns
     -------
@@ -45,7 +48,7 @@ def detect_targets(image: NDArray, settings: DetectionSettings = _DEFAULT) -> De
     Notes
     -----
     Weakness: a lamp or reflection that is a clean ellipse within the size limits is reported as an uncoded dot; only
-    geometry can tell later. Covariances hold for the centre of the dot's image ellipse, not for its eccentricity.
+    geometry can decide later. Covariances hold for the centre of the dot's image ellipse, not for its eccentricity.
     """
     _check(image)
     noise = estimate_noise(image)
@@ -68,7 +71,7 @@ def detect_targets(image: NDArray, settings: DetectionSettings = _DEFAULT) -> De
         more = accept(more, bright, bright_noise, settings, log)
         dots, readings = _merged(bright, dots, readings, more, bright_noise, saturation, settings)
     dots, readings = without_duplicates(dots, readings, log)
-    columns = _columns(dots, readings, settings, np.iinfo(image.dtype).max)
+    columns = _columns(bright, dots, readings, settings)
     if settings.aruco is not None:
         markers = find_markers(image, settings.aruco, noise)
         columns = {name: np.concatenate([columns[name], markers[name]]) for name in columns}
@@ -196,8 +199,10 @@ def _merged(
     return joined, both
 
 
-def _columns(dots: FittedDots, readings: RingReadings, settings: DetectionSettings, top: int) -> dict[str, NDArray]:
-    dark = settings.polarity == "dark"
+def _columns(
+    bright: NDArray, dots: FittedDots, readings: RingReadings, settings: DetectionSettings
+) -> dict[str, NDArray]:
+    dark, top = settings.polarity == "dark", np.iinfo(bright.dtype).max
     state = np.where(
         readings.code >= 0, CodeState.READ, np.where(readings.evidence, CodeState.UNREADABLE, CodeState.NONE)
     )
@@ -216,7 +221,19 @@ def _columns(dots: FittedDots, readings: RingReadings, settings: DetectionSettin
         "residual": dots.residual,
         "chi2": dots.chi2,
         "gain_gradient": dots.gain_gradient,
+        "contour_offset": _contour_offset(bright, dots, settings),
     }
+
+
+def _contour_offset(bright: NDArray, dots: FittedDots, settings: DetectionSettings) -> Array:
+    """(n,) px between the fitted centre of doubtful dots and that of their contour; NaN for the others."""
+    offset = np.full(len(dots), np.nan)
+    rows = np.flatnonzero(dots.misfit > _DOUBTFUL * settings.max_misfit)
+    if rows.size:
+        some = dots.take(rows)
+        centre = contour_centres(bright, some.xy, some.semi_axes, some.background, some.contrast)
+        offset[rows] = np.linalg.norm(centre - some.xy, axis=1)
+    return offset
 
 
 def _detections(

@@ -13,6 +13,10 @@ from robcal.imaging.noise import NoiseModel
 Array = NDArray[np.float64]
 
 
+CONTOUR_SIGMA = 0.02
+"""Standard deviation, px, of the centre of an ellipse through a contour at half height (rendered dots)."""
+
+
 class TargetKind(IntEnum):
     """How a target is coded."""
 
@@ -80,6 +84,9 @@ class Detections:
     blur : (n,) standard deviation of the edge profile, px, without the pixel's own 1/12.
     residual : (n,) RMS residual by contrast. chi2 : (n,) residual variance by the variance expected from noise.
     gain_gradient : (n, 2) relative change of brightness over one pixel; 0 where not significant.
+    contour_offset : (n,) px, distance of the centre from that of the ellipse through the dot's contour, which is
+        independent of the fit to grey values; of doubtful dots only, NaN for all others. A diagnostic: no result
+        depends on it.
     noise : noise model of the image. rejected : what was refused.
     message : empty, or why there is nothing (black image, saturated image).
     """
@@ -99,6 +106,7 @@ class Detections:
     residual: Array
     chi2: Array
     gain_gradient: Array
+    contour_offset: Array
     noise: NoiseModel
     rejected: Rejected
     message: str = ""
@@ -110,27 +118,15 @@ class Detections:
     def __len__(self) -> int:
         return len(self.xy)
 
+    @property
+    def contradicted(self) -> NDArray[np.bool_]:
+        """(n,) doubtful dots whose two centres disagree by more than three standard deviations."""
+        sigma = np.hypot(CONTOUR_SIGMA, np.sqrt(np.trace(self.covariance, axis1=1, axis2=2) / 2.0))
+        return np.asarray(self.contour_offset > 3.0 * sigma)
+
     def columns(self) -> dict[str, NDArray]:
         """The per-target arrays by name."""
         return {name: getattr(self, name) for name in _COLUMNS}
-
-
-_COLUMNS = (
-    "xy",
-    "covariance",
-    "semi_axes",
-    "angle",
-    "contrast",
-    "background",
-    "saturated",
-    "code",
-    "kind",
-    "code_state",
-    "blur",
-    "residual",
-    "chi2",
-    "gain_gradient",
-)
 
 
 def empty_columns(n: int = 0) -> dict[str, NDArray]:
@@ -150,7 +146,11 @@ def empty_columns(n: int = 0) -> dict[str, NDArray]:
         "residual": np.zeros(n),
         "chi2": np.ones(n),
         "gain_gradient": np.zeros((n, 2)),
+        "contour_offset": np.full(n, np.nan),
     }
+
+
+_COLUMNS = tuple(empty_columns())
 
 
 class RejectionLog:

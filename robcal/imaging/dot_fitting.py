@@ -1,6 +1,6 @@
-"""From candidates to fitted dots: the ellipse fits of an image with what all its dots tell together.
+"""From candidates to fitted dots: the ellipse fits of an image with the statistics of all its dots.
 
-Two rounds. The first fits every dot by itself. Then all dots together say how the noise grows with brightness and how
+Two rounds. The first fits every dot by itself. Then all dots together show how the noise grows with brightness and how
 strong gain gradients are in this image; the second round uses both, leaves out single outlying pixels and replaces the
 edge model by a Gaussian spot where the dot is not larger than its blur.
 """
@@ -258,7 +258,7 @@ def _columns(fit: EllipseFits, window: Windows, noise: NoiseModel) -> dict:
     expected = np.where(fit.weight > 0, 1.0 / np.maximum(fit.weight, 1e-30), 0.0).sum(axis=1) / np.maximum(used, 1)
     contrast = parameters[:, 9]
     safe = np.maximum(np.abs(contrast), 1e-6)
-    # beyond its own scatter chi2 tells of misfit or underestimated noise; correlated noise counts by its block means
+    # beyond its own scatter chi2 indicates misfit or underestimated noise; correlated noise counts by its block means
     excess = np.where(chi2 > 1.0 + 3.0 * np.sqrt(2.0 / dof), chi2, 1.0)
     covariance = inverse[:, :2, :2] * (excess * noise.correlation)[:, None, None]
     floor = np.where(fit.is_spot, _FLOOR_SPOT, _FLOOR_EDGE)

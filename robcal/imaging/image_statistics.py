@@ -1,4 +1,4 @@
-"""What all fitted dots of an image tell together: noise around and inside them, its correlation, and shading."""
+"""Statistics of all fitted dots of an image: noise around and inside them, its correlation, and shading."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from robcal.imaging.windows import Windows
 
 Array = NDArray[np.float64]
 
-_CLEAN_RESIDUAL = 0.06  # RMS residual by contrast of a dot that tells about noise
-_SHADING_TOLD = 0.02  # sigma of a dot's relative gradient per radius above which it cannot tell shading from shift
+_CLEAN_RESIDUAL = 0.06  # RMS residual by contrast of a dot that is used to estimate noise
+_SHADING_SIGMA = 0.02  # sigma of a dot's relative gradient per radius above which it cannot separate shading from shift
 
 
 def without_doubt(window: Windows, fit: EllipseFits) -> NDArray[np.bool_]:
-    """(n,) fits that are dots without doubt: only these tell about the image's noise."""
+    """(n,) fits that are dots without doubt: only these are used to estimate the image's noise."""
     used = np.maximum((fit.weight > 0).sum(axis=1), 1)
     rms = np.sqrt(np.where(fit.weight > 0, fit.residual**2, 0.0).sum(axis=1) / used)
     return fit.converged & (rms < _CLEAN_RESIDUAL * np.abs(fit.parameters[:, 9])) & (used > 24)
@@ -113,7 +113,7 @@ def shading_priors(groups: list[Windows], fits: list[EllipseFits]) -> tuple[Arra
         rows = window.index
         square[rows] = 0.5 * (gradient**2).sum(axis=1) / window.radius**2
         variance[rows] = expected * np.maximum(chi2, 1.0) / window.radius**2
-        good[rows], radius[rows] = (chi2 < 50.0) & (expected < _SHADING_TOLD**2), window.radius
+        good[rows], radius[rows] = (chi2 < 50.0) & (expected < _SHADING_SIGMA**2), window.radius
     common = 0.0
     if good.any():
         s, v = square[good], variance[good]
@@ -121,6 +121,7 @@ def shading_priors(groups: list[Windows], fits: list[EllipseFits]) -> tuple[Arra
         for _ in range(8):
             weight = 1.0 / (v[keep] + common) ** 2
             common = max(0.0, float((weight * (s[keep] - v[keep])).sum() / weight.sum()))
-    # a dot with a gradient beyond what is usual here (99.9 % of two normal numbers) is left free, if it can tell at all
-    unusual = (square > 6.9 * (variance + common)) & (variance * radius**2 < _SHADING_TOLD**2)
+    # a dot with a gradient beyond the scatter found here (99.9 % of two normal numbers) is left free, if it is
+    # determined at all
+    unusual = (square > 6.9 * (variance + common)) & (variance * radius**2 < _SHADING_SIGMA**2)
     return radius * np.sqrt(np.where(unusual, square, common)), float(np.sqrt(common))

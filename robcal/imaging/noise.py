@@ -25,7 +25,7 @@ class NoiseModel:
     Attributes
     ----------
     variance : at the grey value `level` (read noise, quantisation, and shot noise there).
-    gain : shot noise, grey values per electron; 0 where the image does not tell.
+    gain : shot noise, grey values per electron; 0 where the image does not determine it.
     level : grey value of the dark ground of the image.
     correlation : variance of sums over neighbouring pixels by that of white noise, >= 1 (JPEG, demosaicing).
     step : quantisation step, grey values (4 for 14-bit data stretched to 16).
@@ -111,7 +111,7 @@ def estimate_noise(image: NDArray) -> NoiseModel:
     flat = [chosen[np.argsort(structure[chosen])[: max(2, int(np.ceil(0.35 * len(chosen))))]] for chosen in classes]
     bin_level = np.array([level[chosen].mean() for chosen in flat])
     bin_variance = np.array([_trimmed_mean(variance[chosen]) for chosen in flat])
-    # a class in which even the flattest tiles have structure tells nothing
+    # a class in which even the flattest tiles have structure is not used
     even = np.array(
         [
             np.median(structure[chosen]) < 4.0 * _CHI2_THIRD * max(float(np.median(variance[chosen])), floor)
@@ -147,16 +147,16 @@ def with_gain(noise: NoiseModel, grey: Array, variance: Array, weight: Array) ->
     grey, variance, weight : (k,) mean grey value and residual variance of the bright pixels of each dot, and the
         number of free residuals behind it.
     """
-    lift = np.asarray(grey, dtype=float) - noise.level
-    use = (np.abs(lift) > 8.0 * noise.sigma) & (weight > 0)
+    signal = np.asarray(grey, dtype=float) - noise.level
+    use = (np.abs(signal) > 8.0 * noise.sigma) & (weight > 0)
     if weight[use].sum() < 30.0:
         return noise
-    grey_lift, found, count = _pooled(lift[use], np.asarray(variance)[use], np.asarray(weight)[use])
+    grey_signal, found, count = _pooled(signal[use], np.asarray(variance)[use], np.asarray(weight)[use])
     # weighted median: single dots with dirt do not count. The median of a mean of k squares lies below its
     # expectation by the factor 1 - 2 / (9 k) cubed (Wilson and Hilferty)
-    gain = (found / (1.0 - 2.0 / (9.0 * count)) ** 3 - noise.variance) / grey_lift
+    gain = (found / (1.0 - 2.0 / (9.0 * count)) ** 3 - noise.variance) / grey_signal
     order = np.argsort(gain)
-    cumulated = np.cumsum((count * np.abs(grey_lift))[order])
+    cumulated = np.cumsum((count * np.abs(grey_signal))[order])
     middle = float(gain[order][np.searchsorted(cumulated, 0.5 * cumulated[-1])])
     positive = middle if noise.gain >= 0 else min(middle, 0.0)
     return NoiseModel(
@@ -164,14 +164,14 @@ def with_gain(noise: NoiseModel, grey: Array, variance: Array, weight: Array) ->
     )
 
 
-def _pooled(lift: Array, variance: Array, weight: Array) -> tuple[Array, Array, Array]:
+def _pooled(signal: Array, variance: Array, weight: Array) -> tuple[Array, Array, Array]:
     """Neighbours in brightness put together until each has at least four free residuals behind it."""
-    order = np.argsort(lift)
+    order = np.argsort(signal)
     group = np.floor(np.cumsum(weight[order]) / 4.0).astype(int)
     group = np.unique(group, return_inverse=True)[1]
     total = np.bincount(group, weight[order])
     return (
-        np.bincount(group, (weight * lift)[order]) / total,
+        np.bincount(group, (weight * signal)[order]) / total,
         np.bincount(group, (weight * variance)[order]) / total,
         total.astype(np.float64),
     )

@@ -1,4 +1,4 @@
-"""Two other centres of a dot, independent of the ellipse fit to grey values: for comparison, not for measuring.
+"""Two other centres of a dot, independent of the ellipse fit to grey values: to question it, not to measure with.
 
 The grey centroid is biased by shading; contours at half height with an ellipse through them (scikit-image) are good
 to some hundredths of a pixel.

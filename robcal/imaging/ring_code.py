@@ -236,7 +236,7 @@ def _is_certain(fit: _Fit, ring: Array, gap: Array, factor: Array, sigma_angle: 
     sigma = fit.sigma * noise[:, None] * scale[:, None]
     distance = np.abs(fit.amplitude * scale[:, None] - 0.5)
     good &= (distance > np.maximum(_MARGIN, 4.0 * sigma)).all(axis=1)
-    # too blurred to be told apart
+    # too blurred to be distinguished
     good &= (factor.max(axis=1) > 0.35).all(axis=1) & (sigma_angle.max(axis=1) < 0.45 * _SEGMENT_ANGLE)
     middle = (np.arange(SEGMENTS) + 0.5) * _SEGMENT_ANGLE
     templates = _window(

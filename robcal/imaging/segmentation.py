@@ -32,7 +32,7 @@ _NEIGHBOURS = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], np.uint8)
 _BAND = 32  # rows
 _TURN = np.arange(16) * (np.pi / 8.0)
 _AROUND = 4  # px from the middle of the smallest parts to what is taken for their background
-_MANY = 8  # parts of a node from which it pays to look at the smallest together
+_MANY = 8  # parts of a node from which it pays to examine the smallest together
 _PEAK_BY_CONTRAST = 0.6  # of a spot in the corner of a pixel
 
 
@@ -108,7 +108,7 @@ def _nodes_above_background(
             contours, hierarchy = cv2.findContours(above, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
             if last or _extended(contours) <= _MAX_PARTS:
                 break
-        # texture and dust without end: look at what stands out more
+        # texture and dust without end: raise the threshold
         lift *= 1.6
     log.count(Reason.TOO_SMALL, single)
     boxes = _boxes(contours, hierarchy, settings, log)

@@ -1,4 +1,4 @@
-"""What the detection may look for: one frozen record of settings, checked when it is made."""
+"""Settings of the target detection, checked when they are made."""
 
 from __future__ import annotations
 

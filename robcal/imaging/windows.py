@@ -141,7 +141,7 @@ def _gather(
         bright = (base + 0.2 * (peak - base)).astype(np.float32)[:, None, None]
         other = (values > bright) & (distance > 2.0 * blur + 0.7)
         valid &= ~_dilate(other)
-    # every k-th row of a large inside or background: neighbours along rows stay, they tell of correlated noise
+    # every k-th row of a large inside or background: neighbours along rows stay, they show correlated noise
     for even in (distance < -(2.5 * blur + 0.5), valid & (distance > 2.5 * blur + 0.5)):
         every = np.maximum(1, np.ceil(even.sum(axis=(1, 2)) / _EVEN_MAX)).astype(int)[:, None, None]
         if every.max() > 1:

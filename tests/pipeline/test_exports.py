@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 from fixtures.campaigns import make_campaign
+from pipeline.artifacts import IDENTIFICATION
 from pipeline.exports import export_run
 from pipeline.prediction import compensate_run, predict_run
 from pipeline.runner import run_campaign
 from pipeline.runs import open_run
-from pipeline.stages.identify import load_identification
 from pipeline.tables import read_table
 from robcal.errors import InvalidInput
 from robcal.robot.model import Term
@@ -43,10 +43,10 @@ def finished(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFa
     )
     run_campaign(folder / "campaign", folder / "run", until="identify")
     run = open_run(folder / "run")
-    found = load_identification(run)
+    found = run.load(IDENTIFICATION)
     assert found.robot.statics == request.param
     with_terms = replace(found.robot, model=found.robot.model.with_terms(TERMS))
-    run.save("identify", replace(found, robot=with_terms))
+    run.save(IDENTIFICATION, replace(found, robot=with_terms))
     return folder / "campaign", folder / "run"
 
 

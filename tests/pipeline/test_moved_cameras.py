@@ -13,10 +13,11 @@ from fixtures.own_effects import draw_own_effect
 from fixtures.own_files import make_own
 from fixtures.own_station import OwnPlan, kept_out_frames
 from fixtures.signature import tip_error_mm
+from pipeline.artifacts import IDENTIFICATION, ORIENTATION
 from pipeline.poses_table import read_poses
 from pipeline.runner import run_campaign
 from pipeline.runs import Run
-from pipeline.stages.identify import load_calibrated, load_identification
+from pipeline.stages.identify import load_calibrated
 from robcal.calibration.calibrated import CalibratedRobot
 from robcal.diagnosis.images.camera_moves import epochs_of
 from robcal.diagnosis.images.diagnosis import ImageFinding
@@ -38,7 +39,7 @@ def test_small_move_is_told_and_the_robot_tells_which_of_two_cameras(tmp_path: P
     effect = _moved(camera)
     make_own(tmp_path / "campaign", effects=[effect], **PLAN)
     run_campaign(tmp_path / "campaign", tmp_path / "run", until="identify")
-    station = Run(tmp_path / "run").load("orient")
+    station = Run(tmp_path / "run").load(ORIENTATION)
     (item,) = [e for e in station.evidence if e.name == "camera_moved"]
     assert item.where == camera
     assert item.alone
@@ -54,7 +55,7 @@ def test_healthy_station_gets_no_epoch_and_a_better_robot_than_from_frames_alone
     truth = make_own(tmp_path / "campaign", effects=[], **PLAN)
     run_campaign(tmp_path / "campaign", tmp_path / "run", until="diagnose")
     run = Run(tmp_path / "run")
-    station = run.load("orient")
+    station = run.load(ORIENTATION)
     assert not any(poses for poses in epochs_of(station).values())
     assert not json.loads(run.diagnosis.read_text())["mismatch"]
 
@@ -63,8 +64,8 @@ def test_healthy_station_gets_no_epoch_and_a_better_robot_than_from_frames_alone
         poses = read_poses(table, calibrated.model, calibrated.model.payloads, to_predict=True)
         return tip_error_mm(calibrated.predict(calibrated.inputs(poses))[0], kept_out_frames(truth))
 
-    assert error(load_calibrated(run)) < 0.6 * error(load_identification(run).robot)
-    recording = load_identification(run).recording
+    assert error(load_calibrated(run)) < 0.6 * error(run.load(IDENTIFICATION).robot)
+    recording = run.load(IDENTIFICATION).recording
     rows = recording.poses
     (frames,) = recording.select(rows, detailed=True)
     columns = common_errors(frames, recording, rows, None, None, station)

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from fixtures.campaigns import make_campaign
+from pipeline.artifacts import IDENTIFICATION
 from pipeline.runner import run_campaign
 from pipeline.runs import Run
 from robcal.calibration.observations import PointObservations
@@ -27,7 +28,7 @@ def test_points_that_state_no_uncertainty_are_diagnosed_as_points(tmp_path: Path
     done = run_campaign(tmp_path / "campaign", tmp_path / "run", until="verify")
     # frames alone do not show the scale: the lengths of the robot absorb it
     assert [c["cause"] for c in done.result["diagnosis"]["causes"]] == ["scale_error"]
-    (points,) = Run(tmp_path / "run").load("identify").recording.detailed
+    (points,) = Run(tmp_path / "run").load(IDENTIFICATION).recording.detailed
     assert isinstance(points, PointObservations)
     # they scatter about their bodies as they are noisy, and as the scale lets them miss their places
     assert 0.9 * variance < 1e6 * points.covariance[0, 0, 0] < 2.0 * variance

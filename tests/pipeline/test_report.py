@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 
 from fixtures.campaigns import make_campaign
+from pipeline.artifacts import EVIDENCE
 from pipeline.report import write_report
 from pipeline.report.blocks import Figure
 from pipeline.report.diagnosis_chapter import _gain
 from pipeline.report.style import label, number, probability
 from pipeline.runner import run_campaign
 from pipeline.runs import Run, open_run
-from robcal.recipe.evidence import Evidence
 from tests.pipeline.conftest import Rows, edit_rows, edit_yaml
 
 HOSTILE = "<script>alert(1)<img src=x onerror=alert(1)>"  # names of campaigns have no slash
@@ -126,7 +126,7 @@ def test_provenance_lists_every_input(page: Page, diagnosed: Run) -> None:
 
 
 def test_evidence_agrees_with_its_law_also_on_poses_kept_out(diagnosed: Run) -> None:
-    evidence: Evidence = diagnosed.load("evidence")
+    evidence = diagnosed.load(EVIDENCE)
     cause = evidence.causes[0]
     pull = (cause.measured - cause.fitted) / cause.sigma
     assert evidence.kind == "verify"

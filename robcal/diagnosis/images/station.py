@@ -17,11 +17,11 @@ from robcal.estimation.grouping import sum_by
 from robcal.photogrammetry.core.bodies import Body
 from robcal.photogrammetry.core.camera import Camera
 from robcal.photogrammetry.station.adjustment import global_columns, interior_basis, interior_prior
+from robcal.photogrammetry.station.assembly import body_weight
 from robcal.photogrammetry.station.contradictions import CAMERA_MOVED
 from robcal.photogrammetry.station.network import StationDesign, StationOrientation, StationSettings, Unknowns
 from robcal.photogrammetry.station.scan import scan_moves
 from robcal.photogrammetry.station.start import exchanged
-from robcal.photogrammetry.station.state import body_weight
 from robcal.physics.cause import Array
 from robcal.physics.images.data import LENS_TERMS, ImageData
 from robcal.transforms import invert, transform

@@ -102,8 +102,8 @@ def adjust_with_colmap(
 ) -> CameraNetwork:
     """Adjust the marks of a network once more, by COLMAP.
 
-    It starts with neither distortion nor principal point, so that the optimum is its own. The result is brought to the
-    scale and frame of ``network`` (by the scale bars if there are any).
+    It starts with neither distortion nor principal point, so that the optimum is independent of ours. The result is
+    brought to the scale and frame of ``network`` (by the scale bars if there are any).
 
     Raises
     ------

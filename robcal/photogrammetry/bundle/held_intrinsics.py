@@ -1,4 +1,4 @@
-"""Interior orientation that a network does not determine: held at its start values, or an error that says why."""
+"""Interior orientation that a network does not determine: held at its start values, or an error with the reason."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def undetermined_intrinsics(problem: Problem, state: State, free: Sequence[str],
 
 
 def raise_singular(problem: Problem, state: State, free: Sequence[str], ids: IntArray) -> NoReturn:
-    """Say which unknowns singular normal equations do not determine.
+    """Raise the error that names the unknowns which singular normal equations do not determine.
 
     Raises
     ------

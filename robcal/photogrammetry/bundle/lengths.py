@@ -9,7 +9,7 @@ import numpy as np
 from scipy import linalg
 
 from robcal.errors import InvalidInput
-from robcal.photogrammetry.core.network import IntArray, LengthResult, Lengths
+from robcal.photogrammetry.core.network import IntArray, LengthKind, LengthResult, Lengths
 from robcal.transforms import Array
 
 _NOTE = 3.3
@@ -94,7 +94,7 @@ def bars_scale(
 
 
 def length_results(
-    lengths: Lengths, ids: IntArray, points: Array, Q: Array, kind: str, bars_sigma0: float = 1.0
+    lengths: Lengths, ids: IntArray, points: Array, Q: Array, kind: LengthKind, bars_sigma0: float = 1.0
 ) -> tuple[LengthResult, ...]:
     """Measured against expected lengths; check lengths with unmeasured end points are left out.
 
@@ -120,15 +120,5 @@ def length_results(
         # a bar that alone gives the scale has no redundancy: its residual is zero by construction
         checked = kind == "check" or sigma > 1e-3 * s
         w = error / sigma if checked and sigma > 0 else 0.0
-        out.append(
-            LengthResult(
-                (a, b),
-                float(d),
-                float(expected),
-                error,
-                sigma if checked else 0.0,
-                w,
-                "scale_bar" if kind == "scale_bar" else "check",
-            )
-        )
+        out.append(LengthResult((a, b), float(d), float(expected), error, sigma if checked else 0.0, w, kind))
     return tuple(out)

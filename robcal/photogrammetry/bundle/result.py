@@ -23,7 +23,7 @@ _BARS_REDUNDANCY = 5.0
 
 @dataclass(frozen=True)
 class NetworkContext:
-    """What a result says besides the estimated values: names, and what was left out before.
+    """What a result contains besides the estimated values: names, and what was left out before.
 
     Attributes
     ----------
@@ -72,7 +72,7 @@ def finish(
     variance_components: bool,
     iterate: bool = True,
 ) -> CameraNetwork:
-    """Variance components until they stand still, then everything that a result has to say.
+    """Variance components until they stand still, then covariances, reliability and correlations.
 
     ``iterate``: minimise again with the estimated components.
     """
@@ -167,7 +167,7 @@ def _bars_growth(problem: Problem, state: State, Q: Array, bars_sigma0: float) -
     redundancy = float(np.sum(1.0 - used))
     if redundancy <= _BARS_REDUNDANCY:
         return 1.0
-    # a bar's certificate is never made better than it says
+    # a bar's certificate is never made better than stated
     squares = float(np.sum(problem.linearised_bars(state.points).r ** 2))
     return max(float(np.sqrt(squares / redundancy)), 1.0 / bars_sigma0)
 

@@ -17,7 +17,7 @@ class AdjustSettings:
         because the tails of real marks are heavier than normal ones, and what lies in them does no harm.
     variance_components : estimate how far the marks (per group) and, from five redundant ones on, the scale bars
         scatter more or less than stated; otherwise the stated covariances are believed.
-    undetermined : 'leave_out' holds intrinsics that the data do not determine at their start values and says so,
+    undetermined : 'leave_out' holds intrinsics that the data do not determine at their start values and lists them,
         'raise' makes it an error. Focal lengths are never left out silently: held only if ``hold_focal``.
     bars_contradiction : scale bars that disagree by more than this many sigmas are an error.
     max_iterations, tolerance : of Gauss-Newton; tolerance on the promised relative decrease of the cost.

@@ -221,9 +221,9 @@ class _Builder:
                 continue
             for _ in range(2):  # once more without the rays that do not meet the others
                 p = R[j] @ point + t[j]
-                miss = np.linalg.norm(project(network.camera, p) - self.marks.xy[rows], axis=1)
-                miss = np.where(np.isfinite(miss), miss, np.inf)
-                good = miss < limit
+                residual = np.linalg.norm(project(network.camera, p) - self.marks.xy[rows], axis=1)
+                residual = np.where(np.isfinite(residual), residual, np.inf)
+                good = residual < limit
                 if good.all() or np.count_nonzero(good) < 2:
                     break
                 again = _closest_point(centre[good], direction[good])

@@ -22,7 +22,7 @@ from robcal.transforms import Array
 class Compact:
     """The problem of what is in use: only images (n,) and targets (t,) with marks, whose rows it names.
 
-    ``note``: on the datum, '' if there is nothing to say.
+    ``note``: on the datum, '' if there is none.
     """
 
     problem: Problem
@@ -83,7 +83,7 @@ class WorkingSet:
         self.summaries.append(summary)
 
     def drop_duplicates(self) -> None:
-        """A target marked twice in one image: at least one mark is wrong and nothing tells which, so both go."""
+        """A target marked twice in one image: at least one mark is wrong and it is unknown which, so both go."""
         key = self.marks.image * (int(self.marks.target.max(initial=0)) + 1) + self.marks.target
         _, inverse, counts = np.unique(key, return_inverse=True, return_counts=True)
         repeated = counts[inverse] > 1

@@ -20,7 +20,7 @@ INTRINSIC_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 
 @dataclass(frozen=True)
 class Camera:
-    """Interior orientation of one camera: size and nine numbers in pixels and OpenCV's coefficients."""
+    """Interior orientation of one camera: size and nine intrinsic parameters in pixels and OpenCV's coefficients."""
 
     width: int
     height: int
@@ -36,14 +36,14 @@ class Camera:
 
     @property
     def vector(self) -> Array:
-        """The nine numbers in the order of :data:`INTRINSIC_NAMES`."""
+        """The intrinsic parameters (9,) in the order of :data:`INTRINSIC_NAMES`."""
         return np.array([getattr(self, name) for name in INTRINSIC_NAMES], dtype=float)
 
     def with_vector(self, numbers: ArrayLike) -> Camera:
-        """The same camera with other nine numbers."""
+        """The same camera with other intrinsic parameters."""
         values = np.asarray(numbers, dtype=float)
         if values.shape != (9,):
-            raise InvalidInput(f"interior orientation needs nine numbers, got shape {values.shape}")
+            raise InvalidInput(f"interior orientation needs nine parameters, got shape {values.shape}")
         return Camera(self.width, self.height, *map(float, values))
 
     @property
@@ -143,9 +143,13 @@ def normalise(camera: Camera, xy: ArrayLike, iterations: int = 50) -> Array:
             a, b = d_point[..., 0, 0], d_point[..., 0, 1]
             c, d = d_point[..., 1, 0], d_point[..., 1, 1]
             det = a * d - b * c
-            miss = target - value
+            residual = target - value
             step = np.stack(
-                [(d * miss[..., 0] - b * miss[..., 1]) / det, (a * miss[..., 1] - c * miss[..., 0]) / det], axis=-1
+                [
+                    (d * residual[..., 0] - b * residual[..., 1]) / det,
+                    (a * residual[..., 1] - c * residual[..., 0]) / det,
+                ],
+                axis=-1,
             )
         ideal = ideal + step
         if np.all(~np.isfinite(step) | (np.abs(step) < 1e-14)):

@@ -2,11 +2,11 @@
 
 A disc of radius r with unit normal n fills the points ``p + r v``, ``v`` a unit disc across n; its image is, to first
 order of its size, the ellipse with the matrix ``S = B A B'``, where ``A = r^2 (I - n n')`` and B is the derivative of
-the pixels by the body's coordinates. S is linear in the six numbers of A, so A follows from the ellipses of all images
+the pixels by the body's coordinates. S is linear in the six elements of A, so A follows from the ellipses of all images
 by least squares; its eigenvalues are r^2, r^2 and 0, the vector of the last one is the normal.
 
-Weaknesses: images from one direction only leave A open; what the detection says of the axes counts (half a percent
-where dots are well exposed), which is ample for the eccentricity of a projected centre.
+Weaknesses: images from one direction only leave A undetermined; the accuracy of the detected axes counts (half a
+percent where dots are well exposed), which is ample for the eccentricity of a projected centre.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ IntArray = NDArray[np.int64]
 _ROUND = 0.5
 """A disc's two large eigenvalues may differ by this factor, and the third be this far from zero, else it is none."""
 _GROSS = 4.0
-"""Ellipses that miss the disc by this many robust sigmas are left out once (half hidden, run into a neighbour)."""
+"""Ellipses that deviate from the disc by this many robust sigmas are left out once (half hidden, run into a
+neighbour)."""
 
 
 _METRIC = 1.25
@@ -36,7 +37,7 @@ _FLAT = np.radians(5.0)
 
 @dataclass(frozen=True)
 class Discs:
-    """Discs of t targets; NaN where the ellipses do not tell.
+    """Discs of t targets; NaN where the ellipses do not determine it.
 
     Attributes
     ----------
@@ -136,13 +137,13 @@ def modelled_discs(seen: Discs, stated: ArrayLike, points: ArrayLike) -> tuple[A
 def facing_normals(modelled: ArrayLike, seen: Discs) -> Array:
     """Outer normals (t, 3): the modelled ones turned to the cameras, those of the ellipses where none is modelled.
 
-    NaN where the ellipses do not tell which way a target faces.
+    NaN where the ellipses do not determine which way a target faces.
     """
     normals = np.asarray(modelled, dtype=float)
     normals = np.where(np.isfinite(normals).all(axis=1)[:, None], normals, seen.normal)
     sign = np.where(np.einsum("ti,ti->t", normals, np.nan_to_num(seen.normal)) < 0, -1.0, 1.0)
-    told = np.isfinite(seen.sigma) & (seen.sigma < _FLAT)
-    return np.where(told[:, None], sign[:, None] * normals, np.nan)
+    determined = np.isfinite(seen.sigma) & (seen.sigma < _FLAT)
+    return np.where(determined[:, None], sign[:, None] * normals, np.nan)
 
 
 def _columns(B: Array, i: int, j: int) -> Array:
@@ -164,8 +165,8 @@ def _fit(design: Array, seen: Array, towards: Array) -> tuple[float, Array, floa
             return None
         inverse = np.linalg.pinv(X / scale, rcond=1e-3) / scale[:, None]
         a = inverse @ y
-        miss = np.linalg.norm((y - X @ a).reshape(-1, 3), axis=1)
-        keep = miss < _GROSS * max(1.4826 * float(np.median(miss)), 1e-6)
+        residual = np.linalg.norm((y - X @ a).reshape(-1, 3), axis=1)
+        keep = residual < _GROSS * max(1.4826 * float(np.median(residual)), 1e-6)
         if attempt or keep.all():
             break
         design, seen, towards = design[keep], seen[keep], towards[keep]

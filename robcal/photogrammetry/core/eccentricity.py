@@ -181,13 +181,13 @@ def _dominant_shape(points: Array, tolerance: float) -> tuple[Array, Array | Non
     chosen = points
     for _ in range(4):
         centre, radius, _ = fit_sphere(chosen)
-        miss = np.abs(np.linalg.norm(points - centre, axis=1) - radius)
+        residual = np.abs(np.linalg.norm(points - centre, axis=1) - radius)
         near = min(0.02 * radius, tolerance)
-        close = miss < max(near, float(np.quantile(miss, 0.7)))
+        close = residual < max(near, float(np.quantile(residual, 0.7)))
         if np.count_nonzero(close) < 6:
             return None
         chosen = points[close]
-    held = np.count_nonzero(miss < near)
+    held = np.count_nonzero(residual < near)
     return (centre, None) if held >= needed else None
 
 

@@ -143,9 +143,12 @@ class RejectedMark:
     reason: str
 
 
+LengthKind = Literal["scale_bar", "check"]
+
+
 @dataclass(frozen=True)
 class LengthResult:
-    """A length after the adjustment, in m: what the network says against what is known.
+    """A length after the adjustment, in m: measured by the network against the known one.
 
     ``sigma`` is that of ``error`` (measured minus expected): network and known length together, for scale bars
     (which take part in the adjustment) that of the residual. ``w`` = error / sigma.
@@ -157,12 +160,12 @@ class LengthResult:
     error: float
     sigma: float
     w: float
-    kind: Literal["scale_bar", "check"]
+    kind: LengthKind
 
 
 @dataclass(frozen=True)
 class Correlation:
-    """Two unknowns that the data hardly tell apart."""
+    """Two unknowns that the data hardly distinguish."""
 
     first: str
     second: str
@@ -178,7 +181,7 @@ class CameraNetwork:
     Attributes
     ----------
     camera : interior orientation; intrinsics_covariance (9, 9) in the order of INTRINSIC_NAMES, zero where held.
-    free_intrinsics : names of the numbers that were estimated; left_out : (name, reason) of those given up.
+    free_intrinsics : names of the estimated intrinsic parameters; left_out : (name, reason) of those given up.
     image_names : (n,) names; camera_T_body : (n, 4, 4); pose_covariance : (n, 6, 6), right perturbation (rho, omega)
         in body coordinates.
     ids : (t,) target ids; points : (t, 3) m in body coordinates; points_covariance : (3t, 3t);
@@ -193,7 +196,7 @@ class CameraNetwork:
         bars_sigma0 : of the scale bars (1 unless estimated).
     redundancy_total : observations minus unknowns plus datum defect.
     rejected : marks taken out; correlations : pairs of unknowns above 0.95.
-    scale_bars, check_lengths : results per length; datum : what fixes the frame, in words.
+    scale_bars, check_lengths : results per length; datum : description of what fixes the frame.
     unknowns : how many are estimated; rank : numerical rank of the normal equations without the datum, so ``unknowns``
         minus its defect (7, with scale bars 6, with fixed targets 0) where the marks determine everything.
     summary : iterations and seconds of all minimisations together; costs and termination of the last one.

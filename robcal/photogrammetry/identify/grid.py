@@ -29,7 +29,7 @@ from robcal.transforms import Array, invert
 
 _MIN_TARGETS = 12
 _SAME = 7.0
-"""Difference of log odds below which two numberings cannot be told apart (odds of 1000 to 1)."""
+"""Difference of log odds below which two numberings cannot be distinguished (odds of 1000 to 1)."""
 _GROWN = 12
 _FEWEST = 0.35
 """Share of the body's targets that must be seen."""
@@ -52,7 +52,7 @@ def search_grid(
     model_error_px: float,
     others: Sequence[View] = (),
 ) -> tuple[list[Grown], str]:
-    """Numberings (targets are rows of ``candidates``) that cannot be told apart, the best first; else a reason.
+    """Numberings (targets are rows of ``candidates``) that cannot be distinguished, the best first; else a reason.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ def search_grid(
         return [], f"{len(chains)} rows of dots in the image, two are needed"
     tolerance = model_error_px + 2.0
     best: Grown | None = None
-    top = -np.inf
+    best_score = -np.inf
     for poses, used in row_hypotheses(camera, xy, points, rows, chains, tolerance):
         own = _like(size, contrast, used)
         tree = cKDTree(xy[own])
@@ -80,14 +80,14 @@ def search_grid(
                 continue
             density = _density(xy[own][found.dots], xy[own])
             value = log_odds(found, points, sigma=usual_error(found.off), density=density)
-            if value > top:
-                top, best = value, _renumbered(found, own)
+            if value > best_score:
+                best_score, best = value, _renumbered(found, own)
         # half of a body is no accident; with less, other rows of the image may show more of it
-        if best is not None and len(best.dots) >= 0.5 * len(points) and _believed(best, len(points), top)[0]:
+        if best is not None and len(best.dots) >= 0.5 * len(points) and _believed(best, len(points), best_score)[0]:
             break
     if best is None:
         return [], _REASON
-    believed, why = _believed(best, len(points), top)
+    believed, why = _believed(best, len(points), best_score)
     if not believed:
         return [], why
     return _with_rivals(camera, xy, size, contrast, points, best, tolerance, others), ""
@@ -106,7 +106,7 @@ def _renumbered(found: Grown, own: IntArray) -> Grown:
 
 
 def _density(matched: Array, like: Array) -> float:
-    """Other dots of like look (k, 2) per px^2 in the rectangle that the matched ones (n, 2) span."""
+    """Other dots of like size and brightness (k, 2) per px^2 in the rectangle that the matched ones (n, 2) span."""
     low, high = matched.min(axis=0), matched.max(axis=0)
     inside = float(((like >= low) & (like <= high)).all(axis=1).sum()) - len(matched)
     return max(inside, 3.0) / float(np.prod(np.maximum(high - low, 1.0)))

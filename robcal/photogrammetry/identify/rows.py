@@ -124,7 +124,7 @@ def _follow(tree: cKDTree, xy: Array, features: Array, chain: list[int]) -> list
     while True:
         known = [k for k in range(max(0, len(chain) - 7), len(chain)) if chain[k] >= 0]
         places = xy[[chain[k] for k in known]]
-        usual = np.median(features[[chain[k] for k in known]], axis=0)
+        typical = np.median(features[[chain[k] for k in known]], axis=0)
         degree = 2 if len(known) >= 6 else 1
         last = known if degree == 2 else known[-4:]
         pitch = float(np.linalg.norm(places[-1] - places[0])) / (known[-1] - known[0])
@@ -132,7 +132,7 @@ def _follow(tree: cKDTree, xy: Array, features: Array, chain: list[int]) -> list
             weights = _extrapolation(tuple(k - (len(chain) - 1 + ahead) for k in last), degree)
             target = weights @ places[-len(last) :]
             near = tree.query_ball_point(target, float(_gate(pitch)) * (1.0 if ahead == 1 else 1.4))
-            near = [i for i in near if i not in chain and (np.abs(features[i] - usual) < 1.5 * _LIKE).all()]
+            near = [i for i in near if i not in chain and (np.abs(features[i] - typical) < 1.5 * _LIKE).all()]
             if near:
                 best = min(near, key=lambda i: float(np.linalg.norm(xy[i] - target)))
                 chain = [*chain, *([-1] * (ahead - 1)), int(best)]
@@ -167,8 +167,8 @@ def row_hypotheses(
             some = three_point_poses(ideal[d[:, [0, 1, 3]]], points[t[:, [0, 1, 3]]])
             seen = project(camera, transform(some[:, :, None], points[t][:, None]))
             with np.errstate(invalid="ignore"):
-                miss = np.sqrt(np.mean(np.sum((seen - xy[d][:, None]) ** 2, axis=-1), axis=-1))
-                poses.append(some[miss < tolerance])
+                residual = np.sqrt(np.mean(np.sum((seen - xy[d][:, None]) ** 2, axis=-1), axis=-1))
+                poses.append(some[residual < tolerance])
         both = np.concatenate([chains[one], chains[two]])
         if sum(len(p) for p in poses):
             yield np.concatenate(poses), np.unique(both[both >= 0])

@@ -1,6 +1,6 @@
 """Finding an uncoded body in an image from its geometry alone: three-point hypotheses, verification, uniqueness.
 
-Each hypothesis puts three targets on three dots (P3P) and predicts all others. It is believed only if chance would
+Each hypothesis puts three targets on three dots (P3P) and predicts all others. It is accepted only if chance would
 hardly produce it (expected number of equally good accidents over all hypotheses below a limit) and if no other
 numbering explains the dots as well: a symmetric arrangement is refused, not guessed.
 """
@@ -24,7 +24,7 @@ from robcal.transforms import Array, transform
 
 _CHANCE = 1e-3
 _SAME = 14.0
-"""Difference of chi-square below which two numberings cannot be told apart (odds of 1000 to 1)."""
+"""Difference of chi-square below which two numberings cannot be distinguished (odds of 1000 to 1)."""
 _BATCH = 20000
 _MORE_TRIPLES = 1
 """Body triples tried beyond the first success, in search of rival numberings."""
@@ -67,7 +67,7 @@ def search_body(
     """
     n, m = len(candidates), len(xy)
     if n < 4:
-        return [], f"{n} uncoded targets with coordinates cannot be told apart by geometry; four or more are needed"
+        return [], f"{n} uncoded targets with coordinates cannot be distinguished by geometry; four or more are needed"
     if m < 4:
         return [], f"only {m} dots in the image"
     if not spans_plane(body.points[candidates]):
@@ -175,9 +175,9 @@ def _best(
     blob = semi_major[np.minimum(index, len(xy) - 1)]
     with np.errstate(invalid="ignore"):
         wrong = (blob > 1.7 * size + 1.0) | (blob < size / 1.7 - 1.0)
-    miss = np.where(np.isfinite(distance) & ~wrong, distance / tolerance, 1.0)
-    score = np.sum(miss**2, axis=1)
-    matched = np.sum(miss < 1.0, axis=1)
+    offset = np.where(np.isfinite(distance) & ~wrong, distance / tolerance, 1.0)
+    score = np.sum(offset**2, axis=1)
+    matched = np.sum(offset < 1.0, axis=1)
     top = np.argsort(score, kind="stable")[:40]
     return [(float(score[k]), poses[k]) for k in top if matched[k] >= 4]
 

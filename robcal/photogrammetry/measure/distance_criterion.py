@@ -1,8 +1,8 @@
 """The distance criterion of a measuring body: distances between measured targets against those of the body.
 
 A pair is accepted if its distance deviates by less than a tolerance; of the targets in rejected pairs the smallest set
-is eliminated that leaves none. Source: thesis section 5.4; here the tolerance comes from the covariance (4 sigma) and
-what recurs from pose to pose is told apart from isolated errors first.
+is eliminated that leaves none (a minimum vertex cover, Karp 1972). The tolerance comes from the covariance (4 sigma);
+what recurs from pose to pose is separated from isolated errors first.
 """
 
 from __future__ import annotations

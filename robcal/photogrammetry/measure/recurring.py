@@ -1,4 +1,4 @@
-"""What recurs in the lengths of a body over many poses: a target that is not where its file says, a wrong scale.
+"""What recurs in the lengths of a body over many poses: a target that is off its place in the file, a wrong scale.
 
 Evidence for the diagnosis, and the reference against which isolated errors are judged.
 """
@@ -19,8 +19,8 @@ _MIN_POSES = 5
 
 @dataclass(frozen=True)
 class TargetShift:
-    """A target that is not where its file says: id, shift (3,) m in body coordinates (true minus file), its covariance,
-    the chi-square of the shift and, where two targets stand in each other's place, the other id."""
+    """A target that is off its place in the file: id, shift (3,) m in body coordinates (true minus file), its
+    covariance, the chi-square of the shift and, where two targets stand in each other's place, the other id."""
 
     target: int
     shift: Array
@@ -108,59 +108,31 @@ def find_recurring(
     table : pairs of all poses; pose, row, p_world the points they come from.
     common_variance : (k,) variance of each pair's distance that all poses share (station), m^2.
     """
-    t = len(body)
     mean, sigma, count = mean_shape(pose, row, p_world, body.points)
-    key = table.a * t + table.b
-    unique, inverse = np.unique(key, return_inverse=True)
-    n = np.bincount(inverse)
-    shared = np.bincount(inverse, weights=common_variance) / n
-    a, b = unique // t, unique % t
-    good = (count[a] >= _MIN_POSES) & (count[b] >= _MIN_POSES) & (n >= _MIN_POSES)
-    a, b, n, shared = a[good], b[good], n[good], shared[good]
-    none = Recurring((), (), None, None, (), mean, "no recurring deviation of lengths")
-    if len(a) == 0:
-        return none
-    d_file = np.linalg.norm(body.points[b] - body.points[a], axis=1)
-    d_mean = np.linalg.norm(mean[b] - mean[a], axis=1)
-    noise = np.sum(sigma[a] ** 2 + sigma[b] ** 2, axis=1) / 3
-    s = np.sqrt(noise + shared + body_pair_variance(body.points, body.covariance, a, b))
-    deviation = d_mean - d_file
-    scale, scale_sigma = _common_scale(deviation, d_file, s)
-    left = deviation - scale * d_file
-    scale_sigma *= _inflation(left / s)
-    s = s * _inflation(left / s)
-    if not (
-        abs(scale) > _SIGNIFICANT * scale_sigma
-        and np.sum(np.abs(left) > _SIGNIFICANT * s) < 0.5 * np.sum(np.abs(deviation) > _SIGNIFICANT * s)
-    ):
-        scale, left = 0.0, deviation
-    else:
-        # the single poses' noise averages out of the scale, the station's and the body's part do not
-        scale_sigma = float(np.hypot(scale_sigma, np.median(np.sqrt(shared) / d_file)))
-    bad = np.abs(left) > _SIGNIFICANT * s
-    found = [
-        RecurringPair(int(body.ids[i]), int(body.ids[j]), float(x), float(y), int(k))
-        for i, j, x, y, k in zip(a, b, deviation, s, n, strict=True)
+    pairs = _mean_pairs(body, table, mean, sigma, count, common_variance)
+    if len(pairs.first) == 0:
+        return Recurring((), (), None, None, (), mean, "no recurring deviation of lengths")
+    scale, scale_sigma, left, s = _scale_and_rest(pairs)
+    ids = body.ids
+    found = tuple(
+        RecurringPair(int(ids[i]), int(ids[j]), float(x), float(y), int(k))
+        for i, j, x, y, k in zip(pairs.first, pairs.second, pairs.deviation, s, pairs.poses, strict=True)
         if abs(x) > _SIGNIFICANT * y
-    ]
-    seen = np.unique(np.concatenate([a, b]))
-    at = {int(i): k for k, i in enumerate(seen)}
-    badness = np.zeros((len(seen), len(seen)))
-    for i, j, x, y in zip(a, b, left, s, strict=True):
-        badness[at[int(i)], at[int(j)]] = badness[at[int(j)], at[int(i)]] = (x / y) ** 2
-    violated = [(at[int(i)], at[int(j)]) for i, j in zip(a[bad], b[bad], strict=True)]
-    removed = culprits(len(seen), violated, badness)
-    unexplained = tuple(
-        f
-        for f, i, j in ((f, at[int(body.index([f.first])[0])], at[int(body.index([f.second])[0])]) for f in found)
-        if removed is None and (i, j) in violated
     )
-    stay = np.array([int(i) for i in seen if at[int(i)] not in (removed or set())])
-    stay = _off_the_plane(body, mean, sigma, stay, 1.0 + scale, float(np.median(shared)))
-    gone = [int(i) for i in seen if i not in stay]
+    seen, ends = np.unique(np.stack([pairs.first, pairs.second]), return_inverse=True)
+    i, j = ends.reshape(2, -1)
+    badness = np.zeros((len(seen), len(seen)))
+    badness[i, j] = badness[j, i] = (left / s) ** 2
+    bad = np.abs(left) > _SIGNIFICANT * s
+    removed = culprits(len(seen), [(int(k), int(m)) for k, m in zip(i[bad], j[bad], strict=True)], badness)
+    violated = {(int(ids[seen[k]]), int(ids[seen[m]])) for k, m in zip(i[bad], j[bad], strict=True)}
+    unexplained = tuple(f for f in found if removed is None and (f.first, f.second) in violated)
+    stay = np.delete(seen, sorted(removed or ()))
+    stay = _off_the_plane(body, mean, sigma, stay, 1.0 + scale, float(np.median(pairs.shared)))
+    gone = np.setdiff1d(seen, stay).tolist()
     targets = _shifts(body, mean, sigma, stay, gone, 1.0 + scale) if gone and removed is not None else ()
     return Recurring(
-        tuple(found),
+        found,
         targets,
         1e6 * scale if scale else None,
         1e6 * scale_sigma if scale else None,
@@ -168,6 +140,52 @@ def find_recurring(
         mean,
         _statement(body, targets, scale, unexplained),
     )
+
+
+@dataclass(frozen=True)
+class _MeanPairs:
+    """Pairs (q,) measured in enough poses: body rows, number of poses, length in the file, deviation of the mean
+    length from it, its standard deviation, and the variance that all poses share."""
+
+    first: IntArray
+    second: IntArray
+    poses: IntArray
+    length: Array
+    deviation: Array
+    sigma: Array
+    shared: Array
+
+
+def _mean_pairs(
+    body: Body, table: PairTable, mean: Array, sigma: Array, count: IntArray, common_variance: Array
+) -> _MeanPairs:
+    t = len(body)
+    unique, inverse = np.unique(table.a * t + table.b, return_inverse=True)
+    n = np.bincount(inverse)
+    shared = np.bincount(inverse, weights=common_variance) / n
+    a, b = unique // t, unique % t
+    good = (count[a] >= _MIN_POSES) & (count[b] >= _MIN_POSES) & (n >= _MIN_POSES)
+    a, b, n, shared = a[good], b[good], n[good], shared[good]
+    length = np.linalg.norm(body.points[b] - body.points[a], axis=1)
+    deviation = np.linalg.norm(mean[b] - mean[a], axis=1) - length
+    noise = np.sum(sigma[a] ** 2 + sigma[b] ** 2, axis=1) / 3
+    s = np.sqrt(noise + shared + body_pair_variance(body.points, body.covariance, a, b))
+    return _MeanPairs(a, b, n, length, deviation, s, shared)
+
+
+def _scale_and_rest(pairs: _MeanPairs) -> tuple[float, float, Array, Array]:
+    """Common scale (0 where not significant) and its sigma, deviations (q,) without it, inflated sigmas (q,)."""
+    scale, scale_sigma = _common_scale(pairs.deviation, pairs.length, pairs.sigma)
+    left = pairs.deviation - scale * pairs.length
+    inflation = _inflation(left / pairs.sigma)
+    scale_sigma, s = scale_sigma * inflation, pairs.sigma * inflation
+    significant = abs(scale) > _SIGNIFICANT * scale_sigma
+    before, after = (int(np.sum(np.abs(d) > _SIGNIFICANT * s)) for d in (pairs.deviation, left))
+    if not (significant and after < 0.5 * before):
+        return 0.0, scale_sigma, pairs.deviation, s
+    # the single poses' noise averages out of the scale, the station's and the body's part do not
+    scale_sigma = float(np.hypot(scale_sigma, np.median(np.sqrt(pairs.shared) / pairs.length)))
+    return scale, scale_sigma, left, s
 
 
 def _inflation(z: Array) -> float:

@@ -146,14 +146,14 @@ def _common_covariance(
     k, e, c, t = len(poses), len(orientation.world_T_exterior), len(orientation.names), len(body)
     B = np.nan_to_num(lin.by_pose)
     N = sum_by(which, np.swapaxes(B, -1, -2) @ B, k)
-    pull = np.swapaxes(B, -1, -2)
+    gain = np.swapaxes(B, -1, -2)
     by_numbers = np.nan_to_num(lin.by_interior) @ np.linalg.inv(interior_basis(interior))[marks.camera]
     pinv = np.linalg.pinv(N, hermitian=True)
 
     def gathered(owner: IntArray, count: int, blocks: Array) -> Array:
-        """(k, 6, count * width) sums of pull @ blocks, one column block per owner."""
+        """(k, 6, count * width) sums of gain @ blocks, one column block per owner."""
         width = blocks.shape[-1]
-        total = sum_by(which * count + owner, pull @ np.nan_to_num(blocks), k * count)
+        total = sum_by(which * count + owner, gain @ np.nan_to_num(blocks), k * count)
         return np.moveaxis(total.reshape(k, count, 6, width), 1, 2).reshape(k, 6, count * width)
 
     K = -pinv @ np.concatenate(

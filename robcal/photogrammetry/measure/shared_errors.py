@@ -39,9 +39,9 @@ def frame_sensitivities(points: MeasuredPoints, frames: MeasuredFrames) -> tuple
         N = np.sum(BW @ B, axis=0)
         if points.station_jacobian is not None:
             by_station[i] = np.linalg.solve(N, np.sum(BW @ points.station_jacobian[rows], axis=0))
-        pull = np.linalg.solve(N, BW @ R)  # a target that lies farther out than its file says pulls the frame back
+        gain = np.linalg.solve(N, BW @ R)  # a target that lies farther out than its file says pulls the frame back
         for row, target in enumerate(at):
-            by_body[i, :, 3 * target : 3 * target + 3] -= pull[row]
+            by_body[i, :, 3 * target : 3 * target + 3] -= gain[row]
     return by_station, by_body
 
 

@@ -1,8 +1,8 @@
 """The method with unknown targets: coordinates of a body from the measured points themselves.
 
-Source: thesis section 5.4: three targets define a frame by Gram-Schmidt orthogonalisation, origin in the first, x axis
-to the second, the third in the x-y plane. With more poses the mean triangle is used instead of each single one, which
-is the same frame with less noise; further targets are added in that frame.
+Three targets define a frame by Gram-Schmidt orthogonalisation (Golub and Van Loan 2013, Matrix Computations, section
+5.2), origin in the first, x axis to the second, the third in the x-y plane. With more poses the mean triangle is used
+instead of each single one, which is the same frame with less noise; further targets are added in that frame.
 """
 
 from __future__ import annotations

@@ -32,10 +32,11 @@ class Cleaned:
 
 
 def resolve_contradictions(state: StationState, adjusted: Adjusted) -> Cleaned:
-    """Largest recurring contradiction first: free what it concerns (or leave a slipped image out), adjust, look again.
+    """Largest recurring contradiction first: free the parameters concerned (or leave a slipped image out), adjust,
+    scan again.
 
     Weakness: with two cameras a move is only seen as a relative one; it is booked on the camera that does not define
-    the world. With fewer than six targets of which three are wrong the majority cannot be told.
+    the world. With fewer than six targets of which three are wrong the majority cannot be determined.
     """
     evidence: list[StationCause] = []
     rejected: list[RejectedMark] = []
@@ -126,7 +127,7 @@ def _worst_target(state: StationState, adjusted: Adjusted) -> StationCause | Non
         return None
     ident = int(state.body.ids[i])
     size = 1e3 * np.linalg.norm(scan.error[i])
-    text = f"target {ident} of body {state.body.name} is {size:.3g} mm from where its file says"
+    text = f"target {ident} of body {state.body.name} is {size:.3g} mm from its place in the file"
     return StationCause(
         TARGET_SHIFTED, str(ident), None, None, scan.error[i], scan.covariance[i], float(scan.statistic[i]), 3, text
     )
@@ -179,8 +180,8 @@ def snoop(state: StationState) -> tuple[Adjusted, tuple[RejectedMark, ...]]:
     """
     rejected: list[RejectedMark] = []
     limit = float(stats.chi2.isf(2 * stats.norm.sf(state.settings.critical), 2))
-    # Gross errors are told by the median's scale, which they do not spoil; what is merely large is then judged by the
-    # root mean square, so that measurements with somewhat long tails are not thinned out.
+    # Gross errors are detected by the median's scale, which they do not spoil; what is merely large is then judged by
+    # the root mean square, so that measurements with somewhat long tails are not thinned out.
     for robust, level in ((True, 4.0 * limit), (False, limit)):
         state.update_noise(state.adjust(None), robust=robust)
         adjusted = state.adjust(None)

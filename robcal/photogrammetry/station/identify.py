@@ -13,14 +13,9 @@ from robcal.errors import RobcalError
 from robcal.imaging.detections import Detections
 from robcal.photogrammetry.core.bodies import Body, IntArray
 from robcal.photogrammetry.core.camera import Camera
-from robcal.photogrammetry.identify.targets import (
-    IdentifiedImage,
-    Prediction,
-    coded_rows,
-    identify_images,
-    identify_targets,
-    predict_dots,
-)
+from robcal.photogrammetry.identify.extension import IdentifiedImage
+from robcal.photogrammetry.identify.prediction import Prediction, predict_dots
+from robcal.photogrammetry.identify.targets import coded_rows, identify_images, identify_targets
 from robcal.photogrammetry.orientation.resection import resect
 from robcal.photogrammetry.station.network import StationMarks, StationOrientation, StationSettings
 from robcal.photogrammetry.station.orientation import orient_station
@@ -92,7 +87,8 @@ def with_recurring_codes(
 ) -> dict[tuple[str, int], IdentifiedImage]:
     """The images with those codes that the pose of nearly every image contradicts: no misreading recurs like that.
 
-    It is the target that sits elsewhere or carries another one's number; what comes after can tell only if it is there.
+    It is the target that sits elsewhere or carries another one's number; later steps can detect that only if it is
+    there.
     """
     read: Counter[int] = Counter()
     against: Counter[int] = Counter()
@@ -172,7 +168,7 @@ def _orient(
         settings = StationSettings(detect_moves=False, detect_targets=False)
         return orient_station(marks, body, cameras, sizes, settings=settings)
     except RobcalError:
-        return None  # the second round is a help only; what is wrong with the station is said by its own stage
+        return None  # the second round is a help only; faults of the station are reported by its own stage
 
 
 def spread_order(points: Array, known: NDArray[np.bool_]) -> IntArray:

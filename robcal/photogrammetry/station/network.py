@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -100,6 +101,9 @@ def movement(camera: str, pose: int, shift: Array) -> str:
     return f"camera {camera} stands elsewhere from pose {pose} on, by {length:.3g} mm and {turn:.2g} deg"
 
 
+RejectionKind = Literal["outlier", "recurring", "contradiction", "no_pose"]
+
+
 @dataclass(frozen=True)
 class StationCause(Cause):
     """Something in the data that contradicts the model again and again, with its test.
@@ -133,7 +137,7 @@ class RejectedMark:
     pose: int
     target: int
     reason: str
-    kind: str = "outlier"
+    kind: RejectionKind = "outlier"
 
 
 @dataclass(frozen=True)

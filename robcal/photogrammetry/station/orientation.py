@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +11,7 @@ from robcal.errors import DegenerateGeometry, InvalidInput, NotIdentifiable
 from robcal.photogrammetry.core.bodies import Body
 from robcal.photogrammetry.core.camera import Camera
 from robcal.photogrammetry.station.adjustment import Adjusted, covariance_blocks, interior_basis, interior_offset
+from robcal.photogrammetry.station.assembly import StationInput, StationStart, assemble
 from robcal.photogrammetry.station.cleaning import drop_insignificant, resolve_contradictions, snoop
 from robcal.photogrammetry.station.contradictions import LENS_AFFINITY, LENS_RADIAL, LENS_TANGENTIAL, TARGET_SWAPPED
 from robcal.photogrammetry.station.network import (
@@ -30,7 +31,7 @@ from robcal.photogrammetry.station.start import (
     resect_station,
     start_bodies,
 )
-from robcal.photogrammetry.station.state import StationState, assemble
+from robcal.photogrammetry.station.state import StationState
 from robcal.transforms import Array
 
 
@@ -69,44 +70,62 @@ def orient_station(
         raise DegenerateGeometry(
             f"body {body.name} has {known.sum()} targets with coordinates; orienting a station needs three or more"
         )
-    stated = dict(world_T_camera or {})
-    marks = [_usable(name, observations[name], body) for name in names]
-    start = [
+    marks = tuple(_usable(name, observations[name], body) for name in names)
+    start = tuple(
         given if (given := cameras.get(n)) is not None else _self_calibrated(n, m, body, sizes[n], options, len(names))
         for n, m in zip(names, marks, strict=True)
-    ]
-    images, failed = resect_station(names, marks, start, body, options.default_sigma_px)
-    if not images:
-        reason = failed[0][2] if failed else "no marks"
-        raise DegenerateGeometry(f"no image of the station carries a pose of body {body.name}: {reason}")
-    evidence: list[StationCause] = []
-    swap = find_swap(marks, start, body, options.default_sigma_px, images)
-    if swap is not None:
-        evidence.append(_swap_evidence(body, *swap))
-        body = exchanged(body, *swap)
-        images, failed = resect_station(names, marks, start, body, options.default_sigma_px)
-    exterior, fixed, contradicting = connect_cameras(names, images, stated)
-    bad = set(contradicting)
-    rejected = [
-        RejectedMark(names[c], p, -1, "image contradicts the other cameras: another pose shown?", "contradiction")
-        for c, p in sorted(bad)
-    ]
-    rejected += [RejectedMark(names[c], p, -1, reason, "no_pose") for c, p, reason in failed]
-    good = [s for s in images if (s.camera, s.pose) not in bad]
-    rejected += _left_out_by_resection(names, marks, good)
-    if not good:
-        raise DegenerateGeometry("the cameras contradict one another in every pose: images of different poses")
-    bodies = start_bodies(good, marks, start, exterior, body, options.default_sigma_px)
-    ambiguous = [p for p, (_, cost, second, n) in bodies.items() if n == 1 and second < cost + 14 * max(1.0, cost / 4)]
-    several = any(n > 1 for _, _, _, n in bodies.values())
-    use = {p: T for p, (T, _, _, _) in bodies.items() if not several or p not in ambiguous}
-    state = assemble(names, marks, good, use, body, start, exterior, fixed, cameras, options)
+    )
+    station, images, failed, evidence = _resected(StationInput(names, marks, body, cameras, options), start)
+    rejected = [RejectedMark(names[c], p, -1, reason, "no_pose") for c, p, reason in failed]
+    connected, ambiguous, contradicting = _connected(station, start, images, dict(world_T_camera or {}))
+    state = assemble(station, connected)
     cleaned = resolve_contradictions(state, state.robust_adjustment())
     drop_insignificant(state, cleaned.adjusted)
     adjusted, outliers = snoop(state)
     evidence += [*cleaned.evidence, *_lens_evidence(state, adjusted, cameras)]
-    left = _tell_recurring([*rejected, *cleaned.rejected, *outliers], marks)
-    return _result(state, adjusted, tuple(sorted(ambiguous)), tuple(evidence), left)
+    resection = _left_out_by_resection(names, marks, connected.images)
+    left = _with_recurring([*contradicting, *rejected, *resection, *cleaned.rejected, *outliers], marks)
+    return _result(state, adjusted, ambiguous, tuple(evidence), left)
+
+
+def _resected(
+    station: StationInput, start: Sequence[Camera]
+) -> tuple[StationInput, list[ImageStart], list[tuple[int, int, str]], list[StationCause]]:
+    """Resections of all images, (camera, pose, reason) of those without one; two swapped targets are exchanged."""
+    names, marks, body, sigma = station.names, station.marks, station.body, station.settings.default_sigma_px
+    images, failed = resect_station(names, marks, start, body, sigma)
+    if not images:
+        reason = failed[0][2] if failed else "no marks"
+        raise DegenerateGeometry(f"no image of the station carries a pose of body {body.name}: {reason}")
+    swap = find_swap(marks, start, body, sigma, images)
+    if swap is None:
+        return station, images, failed, []
+    exchange = exchanged(body, *swap)
+    return (
+        replace(station, body=exchange),
+        *resect_station(names, marks, start, exchange, sigma),
+        [_swap_evidence(body, *swap)],
+    )
+
+
+def _connected(
+    station: StationInput, start: tuple[Camera, ...], images: list[ImageStart], stated: dict[str, Array]
+) -> tuple[StationStart, tuple[int, ...], list[RejectedMark]]:
+    """Start values of the whole station, ambiguous poses, and images that contradict the other cameras."""
+    names = station.names
+    exterior, fixed, contradicting = connect_cameras(names, images, stated)
+    rejected = [
+        RejectedMark(names[c], p, -1, "image contradicts the other cameras: another pose shown?", "contradiction")
+        for c, p in sorted(set(contradicting))
+    ]
+    good = [s for s in images if (s.camera, s.pose) not in set(contradicting)]
+    if not good:
+        raise DegenerateGeometry("the cameras contradict one another in every pose: images of different poses")
+    bodies = start_bodies(good, station.marks, start, exterior, station.body, station.settings.default_sigma_px)
+    ambiguous = [p for p, (_, cost, second, n) in bodies.items() if n == 1 and second < cost + 14 * max(1.0, cost / 4)]
+    several = any(n > 1 for _, _, _, n in bodies.values())
+    use = {p: T for p, (T, _, _, _) in bodies.items() if not several or p not in ambiguous}
+    return StationStart(start, exterior, tuple(fixed), tuple(good), use), tuple(sorted(ambiguous)), rejected
 
 
 def _self_calibrated(
@@ -133,7 +152,7 @@ def _swap_evidence(body: Body, i: int, j: int) -> StationCause:
 
 
 def _left_out_by_resection(
-    names: tuple[str, ...], marks: list[StationMarks], images: list[ImageStart]
+    names: tuple[str, ...], marks: Sequence[StationMarks], images: Sequence[ImageStart]
 ) -> list[RejectedMark]:
     """Marks that the pose of their own image leaves far off."""
     out = []
@@ -145,7 +164,7 @@ def _left_out_by_resection(
     return out
 
 
-def _tell_recurring(rejected: list[RejectedMark], marks: list[StationMarks]) -> tuple[RejectedMark, ...]:
+def _with_recurring(rejected: list[RejectedMark], marks: Sequence[StationMarks]) -> tuple[RejectedMark, ...]:
     """Where most marks of a target were left out it is the target, not the marks: they keep being measured."""
     seen: dict[int, int] = {}
     for m in marks:
@@ -215,7 +234,7 @@ def _result(
     raw = design.residual * state.noise[marks.camera][:, None]
     sigma0 = float(np.sqrt(np.sum(raw**2) / total)) if total > 0 else float("nan")
     pixels = np.einsum("mij,mj->mi", np.linalg.inv(design.whitening), design.residual)
-    # exterior and interior covariance, the interior in its nine numbers
+    # exterior and interior covariance, the interior in its nine parameters
     station = slice(0, 6 * e + 9 * c)
     to_numbers = np.eye(6 * e + 9 * c)
     basis = interior_basis(x.interior)

@@ -37,7 +37,8 @@ def scan_moves(design: StationDesign, marks: MarkTable, cameras: int, poses: int
     """Test all cameras and all change points at once.
 
     ``columns`` (m, 18): global column numbers of each mark's exterior, interior and point unknowns. Weakness: with two
-    cameras only their relative motion shows, so both get (nearly) the same statistic; the robot must tell which moved.
+    cameras only their relative motion shows, so both get (nearly) the same statistic; only the robot can show which
+    moved.
     """
     g = len(design.reduced_inverse)
     root = np.sqrt(design.weights)[:, None, None]
@@ -151,10 +152,10 @@ def scan_targets(points: Array, given: Array, weight: Array, covariance: Array, 
     Notes
     -----
     Baarda's test for a group of observations, ``nabla = (E'P Qv P E)^-1 E'P v`` with ``P Qv P = P - P Q P``. ``rest``
-    tells a wrong target, after which the others fit, from a body that is inaccurate as a whole.
+    distinguishes a wrong target, after which the others fit, from a body that is inaccurate as a whole.
     """
     t = len(points)
-    pull = weight @ (given - points).ravel()
+    gradient = weight @ (given - points).ravel()
     S = weight - weight @ covariance @ weight
     S = 0.5 * (S + S.T)
     floor = 1e-9 * np.array([np.trace(weight[3 * i : 3 * i + 3, 3 * i : 3 * i + 3]) for i in range(t)])
@@ -162,14 +163,14 @@ def scan_targets(points: Array, given: Array, weight: Array, covariance: Array, 
     blocks = 3 * usable[:, None] + np.arange(3)
     for i, at in zip(usable, blocks, strict=True):
         inverse = _pseudo_inverse(S[np.ix_(at, at)][None], floor[i])[0]
-        scan.statistic[i] = float(pull[at] @ inverse @ pull[at])
+        scan.statistic[i] = float(gradient[at] @ inverse @ gradient[at])
         scan.covariance[i] = inverse
-        scan.error[i] = -inverse @ pull[at]
+        scan.error[i] = -inverse @ gradient[at]
         others = blocks[usable != i]
         if len(others) == 0:
             continue
         gain = S[:, at] @ inverse
-        left = (pull - gain @ pull[at])[others]
+        left = (gradient - gain @ gradient[at])[others]
         cross = S[at][:, others]
         conditional = S[others[:, :, None], others[:, None, :]] - np.einsum("jka,ajl->jkl", gain[others], cross)
         inner = _pseudo_inverse(conditional, np.median(floor[usable]))

@@ -1,4 +1,5 @@
-"""Directions of a body's dots from the ellipses that a station's images show, where the body's shape does not tell.
+"""Directions of a body's dots from the ellipses that a station's images show, where the body's shape does not
+determine them.
 
 Dots at different heights on a plate, or on facets, have coordinates but no known normals. Without them the eccentricity
 of a dot's image cannot be modelled, though in many poses the ellipses show plainly how each dot leans.
@@ -54,7 +55,7 @@ def needs_normals(body: Body) -> bool:
 def with_seen_normals(
     body: Body, orientation: StationOrientation, marks: Mapping[str, StationMarks], ellipses: Mapping[str, Ellipses]
 ) -> Body:
-    """The body with outward normals from the ellipses of all cameras, where its shape does not tell them.
+    """The body with outward normals from the ellipses of all cameras, where its shape does not determine them.
 
     Weakness: the mean of the cameras' directions, each weighted by its own scatter; poses that turn the plate little
     before the cameras leave directions open.
@@ -73,9 +74,9 @@ def with_seen_normals(
         seen = discs_from_ellipses(
             orientation.cameras[c], camera_T_body, points, image, target, shape.semi_axes[at], shape.angle[at]
         )
-        told = np.isfinite(seen.sigma)
-        sum_of[told] += seen.normal[told] / seen.sigma[told, None] ** 2
-        weight[told] += seen.sigma[told] ** -2
+        determined = np.isfinite(seen.sigma)
+        sum_of[determined] += seen.normal[determined] / seen.sigma[determined, None] ** 2
+        weight[determined] += seen.sigma[determined] ** -2
     known = weight > SURE**-2
     length = np.linalg.norm(sum_of, axis=1)
     known &= length > 0.9 * weight  # the cameras agree

@@ -36,8 +36,8 @@ class ImageStart:
 def focal_start(marks: StationMarks, body: Body, size: tuple[int, int], sigma_px: float) -> Camera:
     """Camera from the image size alone: the focal length with the best resections of the twelve richest images.
 
-    Weakness: lens distortion is not modelled here, and frontal views of a plane say nothing about the focal length;
-    the adjustment that follows needs only the order of magnitude.
+    Weakness: lens distortion is not modelled here, and frontal views of a plane contain no information on the focal
+    length; the adjustment that follows needs only the order of magnitude.
 
     Raises
     ------
@@ -262,7 +262,7 @@ def connect_cameras(
 def _refuse_slipped(
     first: str, second: str, a: Mapping[int, tuple[Array, ...]], b: Mapping[int, tuple[Array, ...]], agree: int, n: int
 ) -> None:
-    """Say that two cameras do not see the same poses, and whether a shift of the numbering would mend it."""
+    """Report that two cameras do not see the same poses, and whether a shift of the numbering would correct it."""
     for shift in (1, -1, 2, -2, 3, -3):
         common = sorted(p for p in a if p + shift in b)
         if len(common) < 5:

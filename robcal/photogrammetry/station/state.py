@@ -1,30 +1,17 @@
-"""State of a station while it is being oriented: assembling the unknowns, robust adjustment, noise per camera."""
+"""State of a station while it is being oriented: robust adjustment, noise per camera, freed and dropped parts."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from robcal.errors import InvalidInput
 from robcal.photogrammetry.core.bodies import Body, IntArray
 from robcal.photogrammetry.core.camera import Camera
-from robcal.photogrammetry.station.adjustment import (
-    Adjusted,
-    Prior,
-    adjust_station,
-    covariance_blocks,
-    interior_prior,
-    unknown_names,
-)
-from robcal.photogrammetry.station.network import GROUPS, MarkTable, StationMarks, StationSettings, Unknowns
-from robcal.photogrammetry.station.start import ImageStart
+from robcal.photogrammetry.station.adjustment import Adjusted, Prior, adjust_station, covariance_blocks, unknown_names
+from robcal.photogrammetry.station.network import GROUPS, MarkTable, StationSettings, Unknowns
 from robcal.transforms import Array
-
-_TRUST = 0.1
-"""Start values from a camera file may be off by a tenth of what is possible for an unknown lens."""
 
 _MEDIAN_CHI2_2 = 2.0 * np.log(2.0)
 _HUBER = 2.0
@@ -175,136 +162,3 @@ def exterior_index(exterior_camera: IntArray, first: IntArray, camera: IntArray,
         at = np.clip(np.searchsorted(first[rows], pose, side="right") - 1, 0, len(rows) - 1)
         out = np.where(camera == c, rows[at], out)
     return out
-
-
-def interior_groups(
-    names: Sequence[str], cameras: Mapping[str, Camera | None], settings: StationSettings
-) -> tuple[list[set[str]], list[set[str]]]:
-    """Per camera the groups that are tried, and those that are never dropped (given in its file and not zero)."""
-    tried: list[set[str]] = []
-    kept: list[set[str]] = []
-    for name in names:
-        camera = cameras.get(name)
-        tried.append(set() if settings.intrinsics == "fixed" else set(GROUPS))
-        if settings.intrinsics != "auto":
-            kept.append(set(tried[-1]))
-            continue
-        keep = {"focal", "principal"}
-        if camera is not None:
-            keep |= {n for n in ("k1", "k2", "k3") if getattr(camera, n) != 0.0}
-            keep |= {"tangential"} if camera.p1 or camera.p2 else set()
-            keep |= {"affinity"} if camera.fx != camera.fy else set()
-        kept.append(keep)
-    return tried, kept
-
-
-def assemble(
-    names: tuple[str, ...],
-    marks: Sequence[StationMarks],
-    images: Sequence[ImageStart],
-    bodies: Mapping[int, Array],
-    body: Body,
-    start: Sequence[Camera],
-    exterior: Array,
-    fixed: Sequence[int],
-    given: Mapping[str, Camera | None],
-    settings: StationSettings,
-) -> StationState:
-    """One table of all marks of the poses in ``bodies``, start values of all unknowns and their priors."""
-    poses = np.array(sorted(bodies), dtype=np.int64)
-    rows: dict[str, list[np.ndarray]] = {k: [] for k in ("camera", "pose", "target", "xy", "covariance")}
-    for s in images:
-        if s.pose not in bodies:
-            continue
-        m = marks[s.camera]
-        rows["camera"].append(np.full(len(s.rows), s.camera))
-        rows["pose"].append(np.full(len(s.rows), np.searchsorted(poses, s.pose)))
-        rows["target"].append(body.index(m.target[s.rows]))
-        rows["xy"].append(m.xy[s.rows])
-        rows["covariance"].append(m.covariance[s.rows])
-    table = {k: np.concatenate(v) for k, v in rows.items()}
-    target, radius, normals = table["target"], 0.5 * body.diameters, body.estimated_normals()
-    exterior_camera, first = np.arange(len(names)), np.full(len(names), poses[0])
-    mark_table = MarkTable(
-        table["camera"],
-        table["camera"].copy(),
-        table["pose"],
-        target,
-        table["xy"],
-        table["covariance"],
-        radius[target],
-        normals[target],
-    )
-    unknowns = Unknowns(
-        np.array([camera.vector for camera in start]),
-        np.array(exterior, dtype=float),
-        np.array([bodies[int(p)] for p in poses]),
-        np.where(body.known[:, None], body.points, 0.0),
-    )
-    # without a file the prior is a lens without distortion, wherever the start values already are
-    centre = [
-        camera.vector
-        if given.get(name) is not None
-        else Camera(
-            camera.width,
-            camera.height,
-            (f := 0.5 * (camera.fx + camera.fy)),
-            f,
-            0.5 * (camera.width - 1),
-            0.5 * (camera.height - 1),
-        ).vector
-        for name, camera in zip(names, start, strict=True)
-    ]
-    sigma = np.array(
-        [
-            interior_prior(camera) * (1.0 if given.get(name) is None else _TRUST)
-            for name, camera in zip(names, start, strict=True)
-        ]
-    )
-    weight = body_weight(body, mark_table, unknowns, start, settings)
-    tried, kept = interior_groups(names, given, settings)
-    state = StationState(
-        names,
-        tuple(start),
-        body,
-        settings,
-        mark_table,
-        unknowns,
-        Prior(np.array(centre), sigma, unknowns.points.copy(), weight),
-        tried,
-        kept,
-        np.ones(len(names)),
-        exterior_camera,
-        first,
-        tuple(fixed),
-        poses,
-    )
-    for name, changes in settings.epochs.items():
-        if name not in names:
-            raise InvalidInput(f"epochs name a camera {name} that the station does not have: {', '.join(names)}")
-        for pose in sorted(changes):
-            state.add_epoch(names.index(name), pose)
-    for row in body.index(np.array(settings.free_targets, dtype=np.int64)):
-        if row >= 0:
-            state.release_target(int(row))
-    return state
-
-
-def body_weight(
-    body: Body, marks: MarkTable, unknowns: Unknowns, start: Sequence[Camera], settings: StationSettings
-) -> Array:
-    """Inverse covariance (3t, 3t) of the given coordinates.
-
-    A surveyed body's covariance is singular along the motions of its own datum; there the coordinates are held a
-    hundred times tighter than they are known otherwise. Coordinates without covariance get 2 % of the size of a mark's
-    error in space (or ``body_sigma``): too tight to move, loose enough to be tested.
-    """
-    t = len(body)
-    if body.covariance is not None:
-        C = np.array(body.covariance)
-        C = np.where(np.isfinite(C), C, 0.0)
-        return np.asarray(np.linalg.inv(C + max(1e-4 * float(np.mean(np.diag(C))), 1e-18) * np.eye(3 * t)))
-    sight = unknowns.world_T_exterior[marks.exterior][:, :3, 3] - unknowns.world_T_body[marks.pose][:, :3, 3]
-    f = np.array([camera.fx for camera in start])[marks.camera]
-    size = np.linalg.norm(sight, axis=1) / f * np.sqrt(np.einsum("mii->m", marks.covariance) / 2)
-    return np.eye(3 * t) / max(0.02 * float(np.median(size)), settings.body_sigma) ** 2

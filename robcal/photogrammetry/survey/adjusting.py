@@ -19,7 +19,7 @@ from robcal.photogrammetry.survey.inputs import SurveyInput
 
 @dataclass(frozen=True)
 class Adjusted:
-    """An adjusted network and what the ellipses say about the discs of its targets.
+    """An adjusted network and the discs of its targets as estimated from the ellipses.
 
     ``discs`` (of the targets ``network.ids``) and ``size_ratio`` (their diameters, in the scale of the approximate
     values, by stated ones) are None where the eccentricity is not modelled or nothing can be compared.

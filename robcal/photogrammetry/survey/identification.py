@@ -14,7 +14,8 @@ from robcal.photogrammetry.survey.adjusting import Adjusted, Step, readjust
 from robcal.photogrammetry.survey.assignments import Assignments, sightings_in
 from robcal.photogrammetry.survey.inputs import SurveyInput
 from robcal.photogrammetry.survey.late_images import place_late
-from robcal.photogrammetry.survey.matching import Geometry, find_new_points, is_dot, match_known, seen_diameters
+from robcal.photogrammetry.survey.matching import Geometry, is_dot, match_known, seen_diameters
+from robcal.photogrammetry.survey.new_points import find_new_points
 from robcal.transforms import Array
 
 FIRST_NEW_ID = 4096
@@ -45,7 +46,7 @@ def identify_uncoded(given: SurveyInput, table: Assignments, adjusted: Adjusted)
         last = round_ == _ROUNDS - 1 or gained < 0.02 * before
         table, adjusted = readjust(given, table, network, final if last else provisional)
     if "fx" not in adjusted.network.free_intrinsics and not final.settings.hold_focal:
-        # held only for the time of the matching; now it must be determined, or be said not to be
+        # held only for the time of the matching; now it must be determined, or reported as undetermined
         table, adjusted = readjust(given, table, adjusted.network, final)
     return table, adjusted
 

@@ -28,7 +28,7 @@ class Collection:
     names : of the usable images. image (d,), xy (d, 2), covariance (d, 2, 2), semi_axes (d, 2) and angle (d,) of the
         ellipses, NaN where unknown.
     ids : (t,) ids of the targets identified by codes. target : (d,) row of the target, -1: not identified.
-    unused : (name, reason) of images left out already. notes : what else to say.
+    unused : (name, reason) of images left out already. notes : for the report.
     """
 
     names: tuple[str, ...]

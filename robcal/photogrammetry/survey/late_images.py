@@ -1,6 +1,6 @@
 """Images with only three identified targets: placed once the rest of the network is known.
 
-Three points leave up to four poses; the right one is told by the other known targets, which then meet detections.
+Three points leave up to four poses; the other known targets, which must meet detections, select the right one.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
-"""Which uncoded dot is which: guided matching to known points, and new points from consistency over many images.
+"""Which uncoded dot is which: guided matching to known points.
 
 Known points are projected with propagated covariance; a detection is taken only if it is alone within the gate of a
-point that is alone within its reach. New points are hypotheses from pairs of images (rays that meet inside the body's
-surroundings), accepted in the order of their support in all images; what stays ambiguous is left out.
+point that is alone within its reach.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from robcal.photogrammetry.core.camera import Camera, normalise, project, project_with_jacobians
+from robcal.photogrammetry.core.camera import Camera, project_with_jacobians
 from robcal.photogrammetry.core.network import CameraNetwork, IntArray
 from robcal.transforms import Array, skew, transform
 
@@ -144,181 +143,6 @@ def match_known(
             if len(points) == 1 and out[row] < 0 and not taken[points[0]]:
                 out[row] = points[0]
     return out
-
-
-@dataclass(frozen=True)
-class NewPoints:
-    """Points found from uncoded dots: coordinates (q, 3), covariances (q, 3, 3) and the detections of each."""
-
-    points: Array
-    covariance: Array
-    members: tuple[IntArray, ...]
-
-
-def find_new_points(
-    geometry: Geometry,
-    sightings: Sightings,
-    assigned: IntArray,
-    *,
-    centre: Array,
-    radius: float,
-    min_images: int = 3,
-    gate: float = 2.0,
-    partners: int = 4,
-) -> NewPoints:
-    """New points from detections that belong to no known point.
-
-    Parameters
-    ----------
-    centre, radius : sphere in body coordinates outside which nothing can be a target.
-    min_images : images that must support a point. gate : px within which a detection supports a point.
-    """
-    free = assigned < 0
-    n = len(geometry.camera_T_body)
-    R, t = geometry.camera_T_body[:, :3, :3], geometry.camera_T_body[:, :3, 3]
-    station = -np.einsum("nij,ni->nj", R, t)
-    ideal = normalise(geometry.camera, sightings.xy)
-    rays = np.concatenate([ideal, np.ones((len(ideal), 1))], axis=1)
-    rays = np.einsum("dij,di->dj", R[sightings.image], rays)
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    free &= np.isfinite(rays[:, 0])
-    view = (station - centre) / np.linalg.norm(station - centre, axis=1, keepdims=True)
-    angle = np.arccos(np.clip(view @ view.T, -1.0, 1.0))
-    points: list[Array] = []
-    covariances: list[Array] = []
-    members: list[IntArray] = []
-    per_pixel = 1.0 / geometry.camera.fx
-    idle = 0
-    for i in _by_load(sightings.image[free], n):
-        if idle > max(12, n // 4):
-            break
-        mine = np.flatnonzero(free & (sightings.image == i))
-        if len(mine) == 0:
-            continue
-        # best base for the intersection about 35 degrees
-        usable = np.flatnonzero((angle[i] > np.radians(8.0)) & (angle[i] < np.radians(75.0)))
-        usable = usable[np.argsort(np.abs(angle[i, usable] - np.radians(35.0)))][: 3 * partners]
-        loads = np.array([np.count_nonzero(free & (sightings.image == j)) for j in usable])
-        hypotheses: list[Array] = []
-        for j in usable[np.argsort(-loads, kind="stable")][:partners]:
-            other = np.flatnonzero(free & (sightings.image == j))
-            if len(other):
-                tolerance = 1.5 * gate * per_pixel
-                hypotheses.append(_meeting(station[i], rays[mine], station[j], rays[other], tolerance, centre, radius))
-        candidates = np.concatenate(hypotheses) if hypotheses else np.zeros((0, 3))
-        found = 0
-        if len(candidates):
-            accepted = _accept(geometry, sightings, free, candidates, view, gate, min_images)
-            for point, C, rows in accepted:
-                points.append(point)
-                covariances.append(C)
-                members.append(rows)
-                free[rows] = False
-                found += 1
-        idle = 0 if found else idle + 1
-    q = len(points)
-    return NewPoints(np.array(points).reshape(q, 3), np.array(covariances).reshape(q, 3, 3), tuple(members))
-
-
-def _by_load(images: IntArray, n: int) -> list[int]:
-    return [int(i) for i in np.argsort(-np.bincount(images, minlength=n), kind="stable")]
-
-
-def _meeting(a: Array, rays_a: Array, b: Array, rays_b: Array, tolerance: float, centre: Array, radius: float) -> Array:
-    """Points (q, 3) where rays from a (p, 3) and from b (s, 3) pass within ``tolerance`` rad inside the sphere."""
-    base = b - a
-    dot = rays_a @ rays_b.T
-    along_a, along_b = rays_a @ base, rays_b @ base
-    det = np.maximum(1.0 - dot**2, 1e-12)
-    s = (along_a[:, None] - dot * along_b[None]) / det
-    u = (dot * along_a[:, None] - along_b[None]) / det
-    p = a + s[..., None] * rays_a[:, None]
-    q = b + u[..., None] * rays_b[None]
-    miss = np.linalg.norm(p - q, axis=2)
-    middle = 0.5 * (p + q)
-    good = (s > 0) & (u > 0) & (miss < tolerance * np.maximum(s, u))
-    good &= np.linalg.norm(middle - centre, axis=2) < radius
-    return middle[good]
-
-
-def _accept(
-    geometry: Geometry,
-    sightings: Sightings,
-    free: NDArray[np.bool_],
-    candidates: Array,
-    view: Array,
-    gate: float,
-    min_images: int,
-) -> list[tuple[Array, Array, IntArray]]:
-    """Candidates that enough images support, best supported first, every detection used once.
-
-    ``view`` (n, 3): unit directions from the body to the cameras.
-    """
-    n = len(geometry.camera_T_body)
-    size = np.array([geometry.camera.width, geometry.camera.height])
-    hits = np.full((len(candidates), n), -1, dtype=np.int64)
-    seen = np.zeros((len(candidates), n), dtype=bool)
-    for j in range(n):
-        rows = np.flatnonzero(free & (sightings.image == j))
-        xy = project(geometry.camera, transform(geometry.camera_T_body[j], candidates))
-        inside = np.all((xy > 0) & (xy < size - 1), axis=1)
-        seen[:, j] = inside
-        if len(rows) == 0 or not inside.any():
-            continue
-        at = np.flatnonzero(inside)
-        distance, found = cKDTree(sightings.xy[rows]).query(xy[at], distance_upper_bound=1.5 * gate)
-        nearest = np.asarray(found, dtype=np.int64)
-        close = np.isfinite(distance)
-        hits[at[close], j] = rows[nearest[close]]
-    support = np.count_nonzero(hits >= 0, axis=1)
-    claimed: dict[int, int] = {}
-    out: list[tuple[Array, Array, IntArray]] = []
-    for c in np.argsort(-support, kind="stable"):
-        if support[c] < min_images:
-            break
-        rows = hits[c][hits[c] >= 0]
-        rows = np.array([r for r in rows.tolist() if r not in claimed], dtype=np.int64)
-        # most of the support must not have been explained by a better point already
-        if len(rows) < max(min_images, 0.6 * support[c]):
-            continue
-        fitted = _fit_point(geometry, sightings, candidates[c], rows, gate)
-        if fitted is None or len(fitted[2]) < min_images:
-            continue
-        # pictures from about the same side should show it too; an accidental meeting of rays is seen by few of them
-        mean_view = view[sightings.image[fitted[2]]].sum(axis=0)
-        beside = view @ (mean_view / np.linalg.norm(mean_view)) > np.cos(np.radians(40.0))
-        if len(fitted[2]) < 0.5 * np.count_nonzero(seen[c] & beside):
-            continue
-        for row in fitted[2].tolist():
-            claimed[row] = int(c)
-        out.append(fitted)
-    return out
-
-
-def _fit_point(
-    geometry: Geometry, sightings: Sightings, start: Array, rows: IntArray, gate: float
-) -> tuple[Array, Array, IntArray] | None:
-    """Least-squares intersection (point, covariance, supporting rows), dropping what does not fit; None if it fails."""
-    X = start
-    for _ in range(6):
-        if len(rows) < 2:
-            return None
-        for _ in range(4):
-            T = geometry.camera_T_body[sightings.image[rows]]
-            p = np.einsum("nij,j->ni", T[:, :3, :3], X) + T[:, :3, 3]
-            xy, d_point, _ = project_with_jacobians(geometry.camera, p)
-            J = np.einsum("nia,nab->nib", d_point, T[:, :3, :3])
-            r = sightings.xy[rows] - xy
-            A = np.einsum("nia,nib->ab", J, J)
-            if not np.all(np.isfinite(A)) or np.linalg.cond(A) > 1e10:
-                return None
-            X = X + np.linalg.solve(A, np.einsum("nia,ni->a", J, r))
-        miss = np.linalg.norm(r, axis=1)
-        if miss.max() < gate:
-            sigma = max(float(np.sqrt(np.mean(miss**2))), float(np.median(sightings.sigma[rows])), 0.02)
-            return X, sigma**2 * np.linalg.inv(A), rows
-        rows = np.delete(rows, int(np.argmax(miss)))
-    return None
 
 
 def seen_diameters(geometry: Geometry, points: Array, image: IntArray, semi_major: Array) -> Array:

@@ -82,7 +82,7 @@ def survey_body(
 
 
 def _result(given: SurveyInput, final: FinalSurvey, network: CameraNetwork, engine: str) -> SurveyResult:
-    """Put together what there is to say."""
+    """The result of a survey from its final adjustment."""
     table, discs = final.table, final.adjusted.discs
     ids = network.ids.tolist()
     unused = dict([*given.detections.unused, *table.unplaced])

@@ -45,7 +45,7 @@ class SurveySettings:
     Attributes
     ----------
     adjust : settings of the adjustment. free_intrinsics : what self-calibration estimates.
-    new_points : look for uncoded dots without coordinates. min_images : images a new point must be seen in.
+    new_points : search for uncoded dots without coordinates. min_images : images a new point must be seen in.
     eccentricity : model the eccentricity of ellipse centres where a diameter is known.
     reach : new points farther from the body's centre than this many of its radii are no targets.
     """
@@ -65,13 +65,13 @@ class SurveyResult:
     Attributes
     ----------
     network : the adjusted network in the body's frame.
-    frame : what defines that frame, in words. scale : where the scale comes from, in words.
+    frame : description of what defines that frame. scale : where the scale comes from.
     new_ids : ids that the survey gave to dots without id.
     unseen_ids : listed targets that could not be surveyed.
     unused_images : (name, reason). free_detections : detections that belong to no target.
     deviations : (id, metres) distance of each given coordinate from the surveyed one, after the fit.
     engine : which bundle engine made it.
-    normals : (t, 3) outer unit normals of the network's targets where the ellipses tell them, else NaN.
+    normals : (t, 3) outer unit normals of the network's targets where the ellipses determine them, else NaN.
     """
 
     network: CameraNetwork

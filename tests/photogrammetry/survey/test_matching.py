@@ -4,14 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from robcal.photogrammetry.survey.matching import (
-    Geometry,
-    Sightings,
-    find_new_points,
-    is_dot,
-    match_known,
-    seen_diameters,
-)
+from robcal.photogrammetry.survey.matching import Geometry, Sightings, is_dot, match_known, seen_diameters
+from robcal.photogrammetry.survey.new_points import find_new_points
 from tests.photogrammetry.networks import Truth, make_network
 
 
