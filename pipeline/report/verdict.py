@@ -11,7 +11,7 @@ from pipeline.artifacts import CORRECTED
 from pipeline.report.blocks import Grade, KeyFigure, Verdict
 from pipeline.report.diagnosis_chapter import short_statement
 from pipeline.report.material import Material
-from pipeline.report.style import number, percent
+from pipeline.report.style import number, percent, probability
 from pipeline.report.verification_chapter import error_table, noise_by_tool
 from robcal.calibration.observations import FrameObservations
 from robcal.calibration.verification import Verification
@@ -48,7 +48,7 @@ def told_diagnosis(material: Material) -> str:
     left = d.get("unexplained") or {}
     p = left.get("p_value")
     if p is not None and p < LEVEL:
-        text += f" Something stays unexplained (p = {number(p, 2)}" + (
+        text += f" Something stays unexplained (p = {probability(p)}" + (
             f", {left['pattern']})." if left.get("pattern") else ")."
         )
     return text

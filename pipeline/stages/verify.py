@@ -18,6 +18,7 @@ from pipeline.stages.identify import load_calibrated, options_of, require_robot
 from pipeline.tables import write_table
 from robcal.calibration.calibrated import CalibratedRobot
 from robcal.calibration.measurements import RobotObservations
+from robcal.calibration.noise_parts import NoiseParts
 from robcal.calibration.observations import (
     DistanceObservations,
     FrameObservations,
@@ -26,6 +27,7 @@ from robcal.calibration.observations import (
 )
 from robcal.calibration.verdict import verdict
 from robcal.calibration.verification import ErrorStatistics, Verification
+from robcal.recipe.noise import noise_of
 from robcal.recipe.verdict import robot_facts
 from robcal.recipe.verification import verify_robot
 from robcal.robot.model import parameter_unit
@@ -52,7 +54,21 @@ def work(context: Context) -> Outcome:
     facts = robot_facts(identification, calibrated, poses, outcome, diagnosis, doubtful_coordinates(run))
     found = verdict(facts)
     told = {"grade": found.grade, "text": found.text, "reasons": list(found.reasons)}
-    return Outcome({"verification": _result(outcome), "verdict": told}, outputs, notes)
+    noise = noise_of(identification, calibrated, poses)
+    result = {"verification": _result(outcome), "noise": _noise_result(noise), "verdict": told}
+    return Outcome(result, outputs, [*notes, *noise.notes])
+
+
+def _noise_result(noise: NoiseParts) -> dict[str, Any]:
+    return {
+        "measurement_mm": 1e3 * noise.measurement,
+        "source": noise.source,
+        "stated_mm": None if noise.stated is None else 1e3 * noise.stated,
+        "joint_scatter_deg": None if noise.joint_scatter is None else float(np.degrees(noise.joint_scatter)),
+        "lack_of_fit_mm": 1e3 * noise.lack_of_fit,
+        "repeats": noise.repeats,
+        "p_value": noise.p_value,
+    }
 
 
 def doubtful_coordinates(run: Run) -> list[str]:
