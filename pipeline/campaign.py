@@ -26,6 +26,7 @@ from pipeline.robot_import import read_any_robot
 from pipeline.schemas import parse, proposal
 from pipeline.yaml_io import YamlDocument, read_yaml
 from robcal.errors import InvalidInput
+from robcal.physics.gravity_sag import without_masses
 from robcal.robot.chain import chain_of, forward
 from robcal.robot.model import RobotModel
 
@@ -159,6 +160,11 @@ class _Reader:
         if entry.poses is not None:
             poses = read_poses(self._file(entry.poses), robot, robot.payloads if robot else ())
             self.notes.extend(poses.notes)
+        if robot is not None and entry.poses is not None and without_masses(robot):
+            self.notes.append(
+                "the robot file states no masses (mass_kg, cog_mm): sag under the arm's own weight is identified where "
+                "the poses show it, but what another payload does to the arm cannot be predicted"
+            )
         cameras = self._station(poses)
         if poses is None and entry.station is not None:
             poses = self._poses_from_images(cameras)

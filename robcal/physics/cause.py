@@ -149,7 +149,7 @@ class LinearCause(Cause):
     def acts_once(self) -> bool:
         """Whether a place has such a cause at most once: its constants bend one law (a threshold, a torque scale, a
         time constant), while jumps at several poses and waves of several orders may add up."""
-        return len(self.grid) == 1 or bool(self.continuous) or "threshold_Nm" in self.ordered
+        return len(self.grid) == 1 or bool(self.continuous) or bool(self.ordered and not self.kind.of_order)
 
 
 @dataclass(frozen=True)

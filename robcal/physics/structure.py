@@ -8,6 +8,7 @@ import numpy as np
 
 from robcal.cause import Kind
 from robcal.physics.cause import DEG, PER_KNM, Array, Basis, Constants, Entry, Report, RobotCause
+from robcal.physics.gravity_sag import without_masses
 from robcal.physics.prior_scale import LEAST_MOMENT
 from robcal.physics.site import LETTER_OF_KIND, Joint, RobotSite, breaks, each_place, exponential_law
 from robcal.robot.terms import identifier
@@ -237,7 +238,8 @@ def _elastic(site: RobotSite) -> bool:
 
 
 def _payloads(site: RobotSite) -> Iterator[RobotCause]:
-    if not _elastic(site):
+    # where the arm's own weights are not stated, what they do would be taken for a wrong load
+    if not _elastic(site) or without_masses(site.model):
         return
     for name, payload in site.model.payloads.items():
         mass_name = f"payload.{name}.mass"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,6 +21,8 @@ MOST_FREE = 12
 """A law with more amplitudes than these is a Gaussian process: its prior goes into the fit."""
 TERM_PARTS = 24
 """Amplitudes in one expression of the kernel, which may not grow without end."""
+TERM_LENGTH = 2400
+"""Characters of the same."""
 RELEASE = 4.0
 """Factor by which steps may grow after one that lowered the sum of squares."""
 LARGEST_STEP = 5.0
@@ -118,14 +120,25 @@ def terms_of(accepted: Accepted, number: int) -> tuple[Term, ...]:
             name,
             frame,
             kind,
-            " + ".join(f"{p}*({expression})" for p, expression in parts[k : k + TERM_PARTS]),
-            {p: values[p] for p, _ in parts[k : k + TERM_PARTS]},
-            priors={p: sizes[p] for p, _ in parts[k : k + TERM_PARTS] if p in sizes},
+            " + ".join(f"{p}*({expression})" for p, expression in chunk),
+            {p: values[p] for p, _ in chunk},
+            priors={p: sizes[p] for p, _ in chunk if p in sizes},
             cause=cause.name,
         )
         for (frame, kind), parts in groups.items()
-        for k in range(0, len(parts), TERM_PARTS)
+        for chunk in _chunks(parts)
     )
+
+
+def _chunks(parts: Sequence[tuple[str, str]]) -> Iterator[list[tuple[str, str]]]:
+    """Parameters with their expressions, as many together as one expression may hold."""
+    chunk: list[tuple[str, str]] = []
+    for part in parts:
+        if chunk and (len(chunk) == TERM_PARTS or sum(len(text) for _, text in [*chunk, part]) > TERM_LENGTH):
+            yield chunk
+            chunk = []
+        chunk.append(part)
+    yield chunk
 
 
 def fit(

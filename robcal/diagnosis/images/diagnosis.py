@@ -34,6 +34,8 @@ NEARLY_AS_GOOD = 3.0
 ADEQUATE = 1e-3
 DEGENERATE = 1e-6
 """Singular values below this share of the largest are directions that the images do not show."""
+ALIKE, ALIKE_DIRECTION, CLASS = 1.6, 0.9, 3
+"""Ratio of sizes, cosine of directions within which shifts are alike; so many alike are no set of single shifts."""
 LEFT_OVER = 0.2
 """Significance of a smooth field beside a named cause, and its share of what that explains, from which the name does
 not hold."""
@@ -145,9 +147,29 @@ def diagnose_images(data: ImageData, *, moves: bool = True, level: float = LEVEL
     if left_over < ADEQUATE:
         # images that are bent in a manner which nothing explains make single targets look displaced
         findings = [f for f in findings if f.kind.moves != "target" or f.p_value < left_over]
+    classed = _moving_alike(findings)
+    left_over = min([left_over, *(f.p_value for f in classed)])
+    findings = [f for f in findings if f not in classed]
     floor = data.sigma_px
     p_value = findings[0].p_value if findings else last_p
     return ImageDiagnosis(tuple(findings), p_value, left_over, (before, predicted, floor))
+
+
+def _moving_alike(findings: Sequence[ImageFinding]) -> list[ImageFinding]:
+    """Shifts of targets that agree in direction and size: dots of one kind, whose centres share an error of the images.
+
+    Dots on posts, beside an edge, or on one side of a plate are displaced together by what surrounds them; single
+    targets that were really moved have no reason to agree.
+    """
+    shifted = [f for f in findings if f.kind.moves == "target" and "shift_mm" in f.parameters]
+    shifts = np.array([f.parameters["shift_mm"] for f in shifted], dtype=float).reshape(-1, 3)
+    size = np.linalg.norm(shifts, axis=1)
+    if len(shifted) < CLASS or not np.all(size > 0):
+        return []
+    unit = shifts / size[:, None]
+    alike = (unit @ unit.T > ALIKE_DIRECTION) & (size[:, None] < ALIKE * size) & (size < ALIKE * size[:, None])
+    largest = alike[int(np.argmax(alike.sum(axis=1)))]
+    return [f for f, same in zip(shifted, largest, strict=True) if same] if largest.sum() >= CLASS else []
 
 
 def _together(accepted: Sequence[_Accepted], data: ImageData, residual: Array) -> list[_Accepted]:

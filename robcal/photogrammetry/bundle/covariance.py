@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from robcal.photogrammetry.bundle.normals import Factor, Linearised, State, build_normals, linearise
+from robcal.estimation.schur import Factor
+from robcal.photogrammetry.bundle.normals import Linearised, State, build_normals, linearise
 from robcal.photogrammetry.bundle.solver import Problem
 from robcal.transforms import Array
 

@@ -12,19 +12,15 @@ from dataclasses import replace
 import numpy as np
 
 from robcal.errors import DegenerateGeometry
+from robcal.estimation.reliability import critical_value, mark_statistics, variance_factors, worst_marks
+from robcal.estimation.robust import median_scale
 from robcal.photogrammetry.bundle.covariance import cofactors, factorise
 from robcal.photogrammetry.bundle.datum import DatumSpec
 from robcal.photogrammetry.bundle.held_intrinsics import raise_singular, undetermined_intrinsics
 from robcal.photogrammetry.bundle.normals import linearise
 from robcal.photogrammetry.bundle.settings import AdjustSettings
-from robcal.photogrammetry.bundle.snooping import (
-    critical_value,
-    reliability,
-    test_statistics,
-    variance_factors,
-    worst_marks,
-)
-from robcal.photogrammetry.bundle.solver import Problem, minimise, robust_scale
+from robcal.photogrammetry.bundle.snooping import reliability
+from robcal.photogrammetry.bundle.solver import Problem, minimise
 from robcal.photogrammetry.bundle.working_set import Compact, WorkingSet
 from robcal.transforms import Array
 
@@ -83,7 +79,7 @@ def _robust_round(work: WorkingSet, at: Compact, settings: AdjustSettings) -> bo
     if settings.variance_components:
         # robust until the gross errors are gone, then by redundancies
         groups = [problem.group == g for g in range(len(work.group_sigma))]
-        scale = np.array([robust_scale(r[mine]) if mine.any() else 1.0 for mine in groups])
+        scale = np.array([median_scale(r[mine]) if mine.any() else 1.0 for mine in groups])
         work.group_sigma = np.maximum(scale, 1e-9)
     length = np.linalg.norm(r, axis=1) / work.group_sigma[problem.group]
     return settings.snooping and _take_out(work, problem, r, length**2, _GROSS**2, "gross error")
@@ -104,7 +100,7 @@ def _snooping_round(work: WorkingSet, at: Compact, free: Sequence[str], settings
         factors = variance_factors(whitened, rel.share, problem.group, len(work.group_sigma))
         growth = np.sqrt(np.where(np.isfinite(factors) & (factors > 0), factors, 1.0))
         work.group_sigma = work.group_sigma * growth
-    statistic = test_statistics(whitened / growth[problem.group][:, None], rel)
+    statistic = mark_statistics(whitened / growth[problem.group][:, None], rel.residual_cofactor)
     critical = critical_value(len(work.kept), settings.snooping_level)
     # several components shift weights among each other; one alone only scales
     shifted = len(growth) > 1 and np.max(np.abs(growth / growth[0] - 1.0)) > 0.01

@@ -1,4 +1,4 @@
-"""Normal equations of a bundle adjustment: linearised marks, elimination of the stations, solution and cofactors.
+"""Normal equations of a bundle adjustment: linearised marks and their sums.
 
 Unknowns: k numbers of the interior orientation and 3t coordinates (together the reduced system, a = k + 3t), and six
 numbers of every station, which only its own marks see and which are eliminated (Schur complement). Source: Brown
@@ -12,9 +12,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy import linalg
 
+from robcal.estimation.schur import Normals
 from robcal.photogrammetry.core.camera import Camera, project_with_jacobians
 from robcal.photogrammetry.core.network import ImageMarks, IntArray
 from robcal.transforms import Array, retract
@@ -129,21 +128,6 @@ def linearise_lengths(points: Array, rows: IntArray, length: Array, sigma: Array
     return LinearisedLengths((length - distance) / sigma, difference / distance[:, None] / sigma[:, None], rows)
 
 
-@dataclass(frozen=True)
-class Normals:
-    """Normal equations with the stations still in place.
-
-    ``A`` (a, a) of intrinsics and coordinates, ``G`` (n, a, 6) mixed, ``V`` (n, 6, 6) of the stations; right-hand
-    sides ``b`` (a,) and ``s`` (n, 6).
-    """
-
-    A: Array
-    G: Array
-    V: Array
-    b: Array
-    s: Array
-
-
 def build_normals(lin: Linearised, weights: Array | None, order: MarkOrder, lengths: LinearisedLengths) -> Normals:
     """Sum the normal equations; ``weights`` (m,) multiply squared residuals (robust weights, variance components)."""
     k, n, t = lin.k, order.images, order.targets
@@ -196,90 +180,3 @@ def add_lengths(A: Array, b: Array, lengths: LinearisedLengths, k: int) -> None:
         A[at_j, at_i] -= block
         b[at_i] += r * d
         b[at_j] -= r * d
-
-
-class Factor:
-    """Cholesky factors of the normal equations with the stations eliminated.
-
-    Parameters
-    ----------
-    damping : Levenberg factor on the diagonal (0: plain Gauss-Newton).
-    constraints : (3t, d) orthonormal inner constraints on the coordinates, d may be 0.
-    held : (a,) true for unknowns of the reduced system that are held fixed.
-
-    Raises
-    ------
-    numpy.linalg.LinAlgError : the system is singular.
-    """
-
-    def __init__(self, normals: Normals, constraints: Array, held: NDArray[np.bool_], damping: float = 0.0) -> None:
-        A, G, V = normals.A, normals.G, normals.V
-        n, a = len(V), len(A)
-        self.k = a - len(constraints)
-        diagonal = np.diagonal(V, axis1=1, axis2=2)
-        if damping > 0:
-            V = V + damping * np.eye(6) * diagonal[:, :, None]
-        # equilibrate: positions in m and angles in rad differ by orders of magnitude for far or near cameras
-        scale = 1.0 / np.sqrt(np.maximum(diagonal, 1e-300))
-        L = np.linalg.cholesky(V * scale[:, :, None] * scale[:, None, :])
-        self.station_root = np.linalg.inv(L) * scale[:, None, :]  # V^-1 = root' root
-        self.Y = np.ascontiguousarray(
-            np.matmul(G, np.swapaxes(self.station_root, 1, 2)).transpose(1, 0, 2).reshape(a, 6 * n)
-        )
-        S = A - self.Y @ self.Y.T
-        if damping > 0:
-            S[np.diag_indices(a)] += damping * np.diag(A)
-        free = np.flatnonzero(~held)
-        S = S[np.ix_(free, free)]
-        self.scale = 1.0 / np.sqrt(np.maximum(np.diag(A)[free], 1e-300))
-        S *= self.scale[:, None] * self.scale[None, :]
-        self.equilibrated = S
-        B = np.zeros((a, constraints.shape[1]))
-        B[self.k :] = constraints
-        self.constraints = B[free] * self.scale[:, None]
-        if constraints.shape[1]:
-            self.constraints /= np.max(np.abs(self.constraints))
-            S = S + self.constraints @ self.constraints.T
-        self.free, self.a = free, a
-        self.cholesky = linalg.cho_factor(S, lower=True, overwrite_a=False, check_finite=False)
-
-    def solve(self, b: Array, s: Array) -> tuple[Array, Array]:
-        """Steps of the reduced unknowns (a, ...) and the stations (n, 6, ...) for right-hand sides of these shapes."""
-        n = len(s)
-        rest = b.shape[1:]
-        z = np.einsum("nij,nj...->ni...", self.station_root, s)
-        reduced = b - np.tensordot(self.Y, z.reshape((6 * n, *rest)), axes=1)
-        x = np.zeros((self.a, *rest))
-        scale = self.scale.reshape((-1,) + (1,) * len(rest))
-        x[self.free] = scale * linalg.cho_solve(self.cholesky, scale * reduced[self.free], check_finite=False)
-        back = z - np.tensordot(self.Y.T, x, axes=1).reshape((n, 6, *rest))
-        return x, np.einsum("nji,nj...->ni...", self.station_root, back)
-
-    def cofactors(self, null_space: Array) -> Array:
-        """Cofactor matrix (a, a) of intrinsics and coordinates in the datum of the constraints.
-
-        With null space N and constraints B: ``Q = (S + B B')^-1 - N (N' B B' N)^-1 N'``.
-        """
-        inverse, info = linalg.lapack.dpotri(self.cholesky[0], lower=1)
-        if info != 0:
-            raise np.linalg.LinAlgError("singular normal equations")
-        inverse = np.tril(inverse) + np.tril(inverse, -1).T
-        if self.constraints.shape[1]:
-            N = np.zeros((self.a, null_space.shape[1]))
-            N[self.k :] = null_space
-            N = N[self.free] / self.scale[:, None]
-            BN = self.constraints.T @ N
-            inverse -= N @ np.linalg.solve(BN.T @ BN, N.T)
-        inverse *= self.scale[:, None] * self.scale[None, :]
-        Q = np.zeros((self.a, self.a))
-        Q[np.ix_(self.free, self.free)] = inverse
-        return Q
-
-    def station_cofactors(self, Q: Array) -> tuple[Array, Array]:
-        """Cofactors of the stations (n, 6, 6) and mixed ones (a, n, 6) of reduced unknowns and stations."""
-        n = len(self.station_root)
-        Z = np.matmul(np.swapaxes(self.station_root, 1, 2), self.Y.reshape(self.a, n, 6).transpose(1, 2, 0))
-        flat = np.ascontiguousarray(Z.reshape(6 * n, self.a))
-        mixed = -(Q @ flat.T).reshape(self.a, n, 6)
-        own = np.matmul(np.swapaxes(self.station_root, 1, 2), self.station_root)
-        return own - np.matmul(Z, mixed.transpose(1, 0, 2)), mixed

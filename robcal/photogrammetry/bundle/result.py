@@ -7,12 +7,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import linalg
 
+from robcal.estimation.reliability import mark_statistics, variance_factors
+from robcal.estimation.schur import Factor
 from robcal.estimation.summary import SolveSummary
 from robcal.photogrammetry.bundle.covariance import cofactors, factorise
 from robcal.photogrammetry.bundle.determinacy import strong_correlations
 from robcal.photogrammetry.bundle.lengths import distances, length_results
-from robcal.photogrammetry.bundle.normals import Factor, Linearised, State
-from robcal.photogrammetry.bundle.snooping import Reliability, reliability, test_statistics, variance_factors
+from robcal.photogrammetry.bundle.normals import Linearised, State
+from robcal.photogrammetry.bundle.snooping import Reliability, reliability
 from robcal.photogrammetry.bundle.solver import Problem, minimise
 from robcal.photogrammetry.core.network import CameraNetwork, IntArray, Lengths, RejectedMark, frozen
 from robcal.transforms import Array
@@ -103,7 +105,7 @@ def finish(
         residuals=frozen(residuals),
         redundancy=frozen(shares),
         w=frozen(w),
-        statistic=frozen(test_statistics(whitened, end.reliability)),
+        statistic=frozen(mark_statistics(whitened, end.reliability.residual_cofactor)),
         normals=frozen(problem.target_normals(state.points)),
         radii=frozen(problem.radii),
         sigma0=sigma0,

@@ -1,20 +1,21 @@
-"""Gauss-Newton for a bundle adjustment with fallback to damping, optional Huber weights, and eccentricity.
+"""Minimisation of a bundle adjustment with optional Huber weights, and eccentricity.
 
 The problem is what stays fixed during one minimisation; the state is what moves.
 """
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from robcal.estimation.summary import SolveSummary
+from robcal.estimation.levenberg import Linearised, levenberg
+from robcal.estimation.robust import huber_costs, huber_weights, median_scale
+from robcal.estimation.schur import Factor
+from robcal.estimation.summary import SolveSummary, TerminationSettings
 from robcal.photogrammetry.bundle.datum import Datum
 from robcal.photogrammetry.bundle.normals import (
-    Factor,
     LinearisedLengths,
     MarkOrder,
     State,
@@ -111,95 +112,52 @@ class Problem:
         return linearise_lengths(points, self.bars.rows, self.bars.length, self.bars.sigma)
 
 
-def robust_scale(r: Array) -> float:
-    """Standard deviation of a coordinate from the median length of whitened residual vectors (m, 2)."""
-    # the length of a standard normal vector in the plane has the median sqrt(2 ln 2)
-    return float(np.median(np.linalg.norm(r, axis=1)) / np.sqrt(2.0 * np.log(2.0)))
-
-
-def huber_weights(length: Array, limit: float) -> Array:
-    """IRLS weights of residual vectors of these (normalised) lengths."""
-    return np.where(length > limit, limit / np.maximum(length, 1e-300), 1.0)
-
-
 def _cost(r: Array, weights: Array, bars: LinearisedLengths, limit: float | None) -> float:
-    squares = np.sum(r**2, axis=1) * weights
-    if limit is not None:
-        length = np.sqrt(squares)
-        squares = np.where(length > limit, 2.0 * limit * length - limit**2, squares)
-    total = 0.5 * float(np.sum(squares) + np.sum(bars.r**2))
+    length = np.linalg.norm(r, axis=1) * np.sqrt(weights)
+    costs = length**2 if limit is None else huber_costs(length, limit)
+    total = 0.5 * float(np.sum(costs) + np.sum(bars.r**2))
     return total if np.isfinite(total) else float("inf")
 
 
 def minimise(
     problem: Problem, state: State, *, robust: float | None = None, max_iterations: int = 50, tolerance: float = 1e-9
 ) -> tuple[State, SolveSummary]:
-    """Gauss-Newton steps until a step promises less than ``tolerance`` of the cost; damped where the cost would rise.
+    """Steps until one is predicted to save less than ``tolerance`` of the cost; damped where the cost would rise.
 
     Parameters
     ----------
     robust : Huber limit in standard deviations of a residual vector (the scale is re-estimated in every iteration from
         the median, so misstated sigmas do not matter), or None for least squares with the stated covariances.
     """
-    begin = time.perf_counter()
-    order = problem.order
-    shift = problem.shift(state)
-    damping, halvings = 0.0, 0
-    history: list[float] = []
-    converged, words = False, "iteration limit reached"
-    held = problem.held(len(state.points))
-    steps = 0
-    for step in range(1, max_iterations + 1):
-        steps = step
-        lin = linearise(state, order, problem.basis, shift)
+    order, held = problem.order, problem.held(len(state.points))
+
+    def local(at: State) -> Linearised[State]:
+        shift = problem.shift(at)
+        lin = linearise(at, order, problem.basis, shift)
         weights = problem.weights
-        limit = None
         if robust is not None:
-            scale = max(robust_scale(lin.r * np.sqrt(weights)[:, None]), 1e-12)
-            weights = weights / scale**2
-            limit = robust
-        bars = problem.linearised_bars(state.points)
-        cost = _cost(lin.r, weights, bars, limit)
-        if not history:
-            history.append(cost)
+            weights = weights / max(median_scale(lin.r * np.sqrt(weights)[:, None]), 1e-12) ** 2
+        bars = problem.linearised_bars(at.points)
         step_weights = weights
-        if limit is not None:
-            step_weights = weights * huber_weights(np.linalg.norm(lin.r, axis=1) * np.sqrt(weights), limit)
+        if robust is not None:
+            step_weights = weights * huber_weights(np.linalg.norm(lin.r, axis=1) * np.sqrt(weights), robust)
         normals = build_normals(lin, step_weights, order, bars)
-        constraints = problem.constraints(state.points)
-        accepted, promised = False, np.inf
-        for _ in range(14):
-            try:
-                dx, ds = Factor(normals, constraints, held, damping).solve(normals.b, normals.s)
-            except np.linalg.LinAlgError:
-                damping = max(10.0 * damping, 1e-9)
-                continue
-            promised = 0.5 * float(dx @ normals.b + np.sum(ds * normals.s))
-            trial = state.moved(problem.basis, dx, ds)
-            trial_cost = _cost(
-                whitened_residuals(trial, order, shift), weights, problem.linearised_bars(trial.points), limit
+        constraints = problem.constraints(at.points)
+
+        def propose(damping: float) -> tuple[State, float]:
+            dx, ds = Factor(normals, constraints, held, damping).solve(normals.b, normals.s)
+            return at.moved(problem.basis, dx, ds), 0.5 * float(dx @ normals.b + np.sum(ds * normals.s))
+
+        def evaluate(trial: State) -> float:
+            if trial.camera.fx <= 0 or trial.camera.fy <= 0:
+                return np.nan
+            return _cost(
+                whitened_residuals(trial, order, shift), weights, problem.linearised_bars(trial.points), robust
             )
-            if trial.camera.fx > 0 and trial.camera.fy > 0 and trial_cost <= cost * (1.0 + 1e-12) + 1e-12:
-                accepted = True
-                break
-            if promised < tolerance * (1.0 + cost):
-                break
-            halvings += 1
-            damping = max(10.0 * damping, 1e-6)
-        if not accepted:
-            converged = promised < tolerance * (1.0 + cost)
-            words = "converged" if converged else "no step lowers the cost"
-            break
-        state = trial
-        history.append(trial_cost)
-        damping = 0.0 if damping < 1e-7 else damping / 10.0
-        new_shift = problem.shift(state)
-        still = np.max(np.abs(new_shift - shift), initial=0.0)
-        shift = new_shift
-        if promised < tolerance * (1.0 + cost) and damping < 1e-3 and still < 1e-5:
-            converged, words = True, "converged"
-            break
-    summary = SolveSummary(
-        converged, steps, words, history[0], history[-1], tuple(history), halvings, time.perf_counter() - begin
-    )
-    return state, summary
+
+        def settled(trial: State) -> bool:
+            return bool(np.max(np.abs(problem.shift(trial) - shift), initial=0.0) < 1e-5)
+
+        return Linearised(_cost(lin.r, weights, bars, robust), propose, evaluate, settled)
+
+    return levenberg(local, state, TerminationSettings(max_iterations, 13, tolerance))

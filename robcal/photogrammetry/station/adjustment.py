@@ -1,8 +1,8 @@
 """Least-squares adjustment of a station: all cameras, all poses and the body together.
 
-Gauss-Newton with step halving. The body poses are eliminated from the normal equations (Schur complement), so the
-system to solve has only the unknowns of cameras and body, however many poses there are. Source of the elimination:
-Triggs, McLauchlan, Hartley, Fitzgibbon (2000), "Bundle adjustment: a modern synthesis", section 6.1.
+The body poses are eliminated from the normal equations (Schur complement), so the system to solve has only the unknowns
+of cameras and body, however many poses there are. Source of the elimination: Triggs, McLauchlan, Hartley, Fitzgibbon
+(2000), "Bundle adjustment: a modern synthesis", section 6.1.
 """
 
 from __future__ import annotations
@@ -16,6 +16,9 @@ from scipy import linalg
 
 from robcal.errors import NotIdentifiable
 from robcal.estimation.grouping import sum_by, whitener
+from robcal.estimation.levenberg import Linearised, levenberg
+from robcal.estimation.robust import huber_costs, huber_weights
+from robcal.estimation.summary import SolveSummary, TerminationSettings
 from robcal.photogrammetry.core.camera import INTRINSIC_NAMES, Camera, project_with_jacobians
 from robcal.photogrammetry.core.eccentric_circle import effective_point
 from robcal.photogrammetry.station.network import MarkTable, StationDesign, Unknowns
@@ -122,14 +125,13 @@ class Prior:
 
 @dataclass(frozen=True)
 class Adjusted:
-    """Solution of the adjustment: unknowns, linearised model, sum of squares of marks and of priors, steps taken."""
+    """Solution of the adjustment: unknowns, linearised model, sum of squares of marks and of priors, how it ended."""
 
     unknowns: Unknowns
     design: StationDesign
     cost: float
     prior_cost: float
-    iterations: int
-    converged: bool
+    summary: SolveSummary
 
 
 def interior_offset(x: Unknowns, prior: Prior) -> Array:
@@ -162,21 +164,38 @@ def _prior_terms(x: Unknowns, prior: Prior) -> tuple[Array, Array, float]:
     b[at] = -weight * offset
     cost = float(np.sum(weight * offset**2))
     if prior.points_weight is not None:
-        miss = (prior.points - x.points).ravel()
-        pull = prior.points_weight @ miss
+        residual = (prior.points - x.points).ravel()
+        pull = prior.points_weight @ residual
         N[6 * e + 9 * c :, 6 * e + 9 * c :] = prior.points_weight
         b[6 * e + 9 * c :] = pull
-        cost += float(miss @ pull)
+        cost += float(residual @ pull)
     return N, b, cost
 
 
 @dataclass(frozen=True)
 class _System:
-    reduced: Array
+    """Normal equations: ``matrix`` (g, g), ``right`` (g,) of the global unknowns, ``coupling`` (g, p, 6), and
+    ``pose_matrix`` (p, 6, 6), ``pose_right`` (p, 6) of the poses."""
+
+    matrix: Array
     right: Array
-    pose_inverse: Array
     coupling: Array
+    pose_matrix: Array
     pose_right: Array
+
+    def reduced(self, damping: float = 0.0) -> tuple[Array, Array, Array]:
+        """Matrix and right side without the poses, and the inverses (p, 6, 6) of these; all diagonals damped."""
+        V, g = self.pose_matrix, len(self.matrix)
+        diagonal = np.einsum("pii->pi", V)
+        scale = np.sqrt(np.maximum(diagonal, 1e-300))
+        seen = diagonal.min(axis=1) > 0  # a pose whose marks were all left out keeps its value
+        inverse = np.zeros_like(V)
+        outer = scale[:, :, None] * scale[:, None, :]
+        inverse[seen] = np.linalg.inv(V[seen] / outer[seen] + (damping + 1e-13) * np.eye(6)) / outer[seen]
+        T = np.matmul(self.coupling.transpose(1, 0, 2), inverse).transpose(1, 0, 2).reshape(g, -1)
+        N = self.matrix - T @ self.coupling.reshape(g, -1).T
+        N[np.diag_indices(g)] += damping * np.diag(self.matrix)
+        return N, self.right - T @ self.pose_right.ravel(), inverse
 
 
 def _normal(lin: Linearisation, marks: MarkTable, x: Unknowns, prior: Prior, weights: Array) -> _System:
@@ -212,13 +231,7 @@ def _normal(lin: Linearisation, marks: MarkTable, x: Unknowns, prior: Prior, wei
         N[first : first + 3, at] += products[:, :15]
         N[at, first : first + 3] += products[:, :15].T
         N[first : first + 3, first : first + 3] += products[:, 15:]
-    scale = np.sqrt(np.maximum(np.einsum("pii->pi", V), 1e-300))
-    seen = np.einsum("pii->pi", V).min(axis=1) > 0  # a pose whose marks were all left out keeps its value
-    Vi = np.zeros_like(V)
-    outer = scale[:, :, None] * scale[:, None, :]
-    Vi[seen] = np.linalg.inv(V[seen] / outer[seen] + 1e-13 * np.eye(6)) / outer[seen]
-    T = np.matmul(W.transpose(1, 0, 2), Vi).transpose(1, 0, 2).reshape(g, 6 * p)
-    return _System(N - T @ W.reshape(g, 6 * p).T, b - T @ v.ravel(), Vi, W, v)
+    return _System(N, b, W, V, v)
 
 
 def _groups(key: NDArray[np.int64]) -> list[NDArray[np.int64]]:
@@ -278,20 +291,25 @@ def _apply(x: Unknowns, global_step: Array, pose_step: Array, basis: Array) -> U
     )
 
 
-def huber_weights(residual: Array, limit: float) -> Array:
-    """(m,) weights of Huber's function on the length of each whitened residual (m, 2); 0 for NaN."""
-    size = np.linalg.norm(residual, axis=1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(np.isfinite(size), np.where(size <= limit, 1.0, limit / size), 0.0)
+def _weights(residual: Array, limit: float | None) -> Array:
+    """(m,) weights of whitened residuals (m, 2): Huber's on their lengths, or one."""
+    return np.ones(len(residual)) if limit is None else huber_weights(np.linalg.norm(residual, axis=1), limit)
 
 
-def _robust_cost(residual: Array, limit: float | None) -> float:
-    size = np.linalg.norm(residual, axis=1)
-    if not np.isfinite(size).all():
+def _cost(residual: Array, limit: float | None) -> float:
+    length = np.linalg.norm(residual, axis=1)
+    if not np.isfinite(length).all():
         return np.inf
-    if limit is None:
-        return float(np.sum(size**2))
-    return float(np.sum(np.where(size <= limit, size**2, 2 * limit * size - limit**2)))
+    return float(np.sum(length**2 if limit is None else huber_costs(length, limit)))
+
+
+@dataclass(frozen=True)
+class _At:
+    """Unknowns with the marks linearised there; ``half_cost`` with the priors."""
+
+    unknowns: Unknowns
+    lin: Linearisation
+    half_cost: float
 
 
 def adjust_station(
@@ -318,59 +336,55 @@ def adjust_station(
     ------
     NotIdentifiable : the reduced normal matrix of the active unknowns is singular.
     """
-    x = start
-    converged = False
     on = np.flatnonzero(active)
     active_names = [names[i] for i in on]
-    iterations = 0
-    lin = linearise(marks, x, cameras, noise)
-    cost = _robust_cost(lin.residual, huber) + _prior_terms(x, prior)[2]
-    for _ in range(max_iterations):
-        weights = np.ones(len(marks)) if huber is None else huber_weights(lin.residual, huber)
-        clean = Linearisation(*(np.where(np.isfinite(a), a, 0.0) for a in vars(lin).values()))
-        system = _normal(clean, marks, x, prior, weights)
-        step = np.zeros(len(active))
-        step[on] = _solve_scaled(system.reduced[np.ix_(on, on)], system.right[on], active_names)[0]
-        rest = system.pose_right - np.einsum("gpi,g->pi", system.coupling, step)
-        pose_step = np.einsum("pij,pj->pi", system.pose_inverse, rest)
-        basis = interior_basis(x.interior)
-        factor = 1.0
-        for _ in range(12):
-            trial = _apply(x, factor * step, factor * pose_step, basis)
-            lin_trial = linearise(marks, trial, cameras, noise)
-            cost_trial = _robust_cost(lin_trial.residual, huber) + _prior_terms(trial, prior)[2]
-            if cost_trial <= cost * (1 + 1e-12) or (not np.isfinite(cost) and np.isfinite(cost_trial)):
-                break
-            factor *= 0.5
-        else:
-            converged = True  # no descent along the Gauss-Newton step: at the floor of the arithmetic
-            break
-        gain = cost - cost_trial
-        x, lin, cost = trial, lin_trial, cost_trial
-        iterations += 1
-        if gain <= 1e-7 * max(1.0, cost / max(1, len(marks))):
-            converged = True
-            break
-    weights = np.ones(len(marks)) if huber is None else huber_weights(lin.residual, huber)
-    clean = Linearisation(*(np.where(np.isfinite(a), a, 0.0) for a in vars(lin).values()))
-    system = _normal(clean, marks, x, prior, weights)
-    inverse = np.zeros_like(system.reduced)
-    inverse[np.ix_(on, on)] = _solve_scaled(system.reduced[np.ix_(on, on)], system.right[on], active_names)[1]
+
+    def at(x: Unknowns) -> _At:
+        lin = linearise(marks, x, cameras, noise)
+        return _At(x, lin, 0.5 * (_cost(lin.residual, huber) + _prior_terms(x, prior)[2]))
+
+    def system_at(here: _At) -> tuple[Linearisation, Array, _System]:
+        weights = _weights(here.lin.residual, huber)
+        clean = Linearisation(*(np.where(np.isfinite(a), a, 0.0) for a in vars(here.lin).values()))
+        return clean, weights, _normal(clean, marks, here.unknowns, prior, weights)
+
+    def local(here: _At) -> Linearised[_At]:
+        _, _, system = system_at(here)
+        basis = interior_basis(here.unknowns.interior)
+
+        def propose(damping: float) -> tuple[_At, float]:
+            N, b, pose_inverse = system.reduced(damping)
+            step = np.zeros(len(active))
+            step[on] = _solve_scaled(N[np.ix_(on, on)], b[on], active_names)[0]
+            rest = system.pose_right - np.einsum("gpi,g->pi", system.coupling, step)
+            pose_step = np.einsum("pij,pj->pi", pose_inverse, rest)
+            saved = 0.5 * float(step @ system.right + np.sum(pose_step * system.pose_right))
+            return at(_apply(here.unknowns, step, pose_step, basis)), saved
+
+        return Linearised(here.half_cost, propose, lambda trial: trial.half_cost)
+
+    tolerance = 0.5e-7  # of a mark's share of the sum of squares
+    settings = TerminationSettings(max_iterations, 12, 2.0 * tolerance / max(1, len(marks)), tolerance)
+    end, summary = levenberg(local, at(start), settings)
+    clean, weights, system = system_at(end)
+    N, b, pose_inverse = system.reduced()
+    inverse = np.zeros_like(N)
+    inverse[np.ix_(on, on)] = _solve_scaled(N[np.ix_(on, on)], b[on], active_names)[1]
     design = StationDesign(
         clean.residual,
         clean.by_exterior,
         clean.by_interior,
         clean.by_point,
         clean.by_pose,
-        lin.whitening,
+        end.lin.whitening,
         weights,
         active,
         inverse,
-        system.pose_inverse,
+        pose_inverse,
         system.coupling,
     )
     mark_cost = float(np.sum(clean.residual**2))
-    return Adjusted(x, design, mark_cost, _prior_terms(x, prior)[2], iterations, converged)
+    return Adjusted(end.unknowns, design, mark_cost, _prior_terms(end.unknowns, prior)[2], summary)
 
 
 def covariance_blocks(design: StationDesign, marks: MarkTable, e: int, c: int) -> tuple[Array, Array]:

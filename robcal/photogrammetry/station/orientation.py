@@ -277,6 +277,6 @@ def _result(
         rejected=rejected,
         evidence=evidence,
         free_interior={name: tuple(g for g in GROUPS if g in state.groups[i]) for i, name in enumerate(state.names)},
-        converged=adjusted.converged,
-        iterations=adjusted.iterations,
+        converged=adjusted.summary.converged,
+        iterations=adjusted.summary.iterations,
     )

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from robcal.diagnosis.images.diagnosis import diagnose_images, spread_of_others
+from robcal.diagnosis.images.diagnosis import _moving_alike, diagnose_images, spread_of_others
 from robcal.diagnosis.images.exchange import exchanged_targets
 from robcal.photogrammetry.core.eccentricity import centre_shift
 from robcal.physics.images.data import survey_data
@@ -173,3 +173,18 @@ def test_centres_displaced_along_the_tilt_of_dots():
 
 def test_dots_of_a_healthy_station_have_no_bias():
     assert not diagnose_images(_dots(13)).findings
+
+
+def test_dots_that_move_together_are_no_set_of_shifted_targets():
+    """Dots on posts whose rims bias all their centres alike: nothing was moved, and it is not silent either."""
+    scene = station("target_shifted", snr=7.5, seed=5, targets=20)
+    (found,) = diagnose_images(scene.data).findings
+    height = np.array([0.0, 0.0, 0.024])
+    posts = [
+        replace(found, where=str(k), parameters={"shift_mm": (height * size + [0.001 * k, 0, 0]).tolist()})
+        for k, size in enumerate((0.9, 1.0, 1.1))
+    ]
+    elsewhere = replace(found, where="9", parameters={"shift_mm": [0.03, 0.0, 0.0]})
+    assert _moving_alike([*posts, elsewhere]) == posts
+    assert _moving_alike([*posts[:2], elsewhere]) == []
+    assert _moving_alike([*posts[:2], replace(posts[2], parameters={"shift_mm": [0.0, 0.0, 0.24]})]) == []

@@ -9,10 +9,11 @@ import pytest
 from scipy import optimize, stats
 
 from robcal.errors import DegenerateGeometry, InvalidInput, NotIdentifiable
+from robcal.estimation.schur import Factor
 from robcal.photogrammetry.bundle.adjustment import AdjustSettings, adjust
 from robcal.photogrammetry.bundle.datum import Datum, InnerOver
 from robcal.photogrammetry.bundle.determinacy import intrinsics_basis
-from robcal.photogrammetry.bundle.normals import Factor, MarkOrder, State, build_normals, linearise, linearise_lengths
+from robcal.photogrammetry.bundle.normals import MarkOrder, State, build_normals, linearise, linearise_lengths
 from robcal.photogrammetry.bundle.solver import Bars, Problem, minimise
 from robcal.photogrammetry.core.camera import INTRINSIC_NAMES, Camera, project
 from robcal.photogrammetry.core.network import CameraNetwork, ImageMarks, Lengths

@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from robcal.estimation.reliability import critical_value, mark_statistics, variance_factors, worst_marks
 from robcal.photogrammetry.bundle.adjustment import adjust
 from robcal.photogrammetry.bundle.covariance import cofactors, factorise
 from robcal.photogrammetry.bundle.normals import Linearised
 from robcal.photogrammetry.bundle.operator import problem_of
 from robcal.photogrammetry.bundle.settings import AdjustSettings
-from robcal.photogrammetry.bundle.snooping import critical_value, reliability, variance_factors, worst_marks
-from robcal.photogrammetry.bundle.snooping import test_statistics as mark_statistics
+from robcal.photogrammetry.bundle.snooping import reliability
 from robcal.photogrammetry.core.network import CameraNetwork, ImageMarks
 from robcal.transforms import Array
 from tests.photogrammetry.networks import Truth, make_network
@@ -72,9 +72,9 @@ def test_statistic_of_a_fully_redundant_mark_is_its_squared_length() -> None:
     rel = reliability(lin, problem.order, factor, cofactors(problem, state, factor), problem.weights)
     full = replace(rel, residual_cofactor=np.tile(np.eye(2), (3, 1, 1)))
     r = np.array([[3.0, 4.0], [0.0, 0.0], [1.0, -1.0]])
-    np.testing.assert_allclose(mark_statistics(r, full), [25.0, 0.0, 2.0])
+    np.testing.assert_allclose(mark_statistics(r, full.residual_cofactor), [25.0, 0.0, 2.0])
     none = replace(rel, residual_cofactor=np.zeros((3, 2, 2)))
-    np.testing.assert_array_equal(mark_statistics(r, none), 0.0)
+    np.testing.assert_array_equal(mark_statistics(r, none.residual_cofactor), 0.0)
 
 
 def test_one_mark_of_an_image_and_of_a_target_at_a_time() -> None:
