@@ -10,7 +10,7 @@ class RobcalError(Exception):
 
 
 class InvalidInput(RobcalError):
-    """Data or settings that contradict the contract: a NaN, a wrong unit, an unknown name."""
+    """Data or settings that contradict their format: a NaN, a wrong unit, an unknown name."""
 
 
 class DegenerateGeometry(RobcalError):

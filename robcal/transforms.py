@@ -1,9 +1,9 @@
-"""Frames as homogeneous 4x4 matrices, their six numbers, small perturbations and covariance transport.
+"""Frames as homogeneous 4x4 matrices, their six pose parameters, small perturbations and covariance transport.
 
 Conventions (the one place where they are stated):
 
 - ``a_T_b`` maps coordinates in b to coordinates in a: ``p_a = a_T_b p_b``.
-- ``R(roll, pitch, yaw) = Rz(yaw) Ry(pitch) Rx(roll)``; six numbers of a frame are ``(x, y, z, roll, pitch, yaw)``.
+- ``R(roll, pitch, yaw) = Rz(yaw) Ry(pitch) Rx(roll)``; pose parameters are ``(x, y, z, roll, pitch, yaw)``.
 - A frame is perturbed on the right, translation first: ``retract(a_T_b, (rho, omega)) = a_T_b [Exp(omega), rho]``,
   so a 6x6 covariance is in the coordinates of b, metres first, then radians.
 
@@ -60,13 +60,13 @@ def frame(a_R_b: ArrayLike, a_t_b: ArrayLike) -> Array:
 
 
 def frame_from_xyzrpy(six: ArrayLike) -> Array:
-    """Frames ``(..., 4, 4)`` from six numbers ``(..., 6)``: x, y, z in m, roll, pitch, yaw in rad."""
+    """Frames ``(..., 4, 4)`` from pose parameters ``(..., 6)``: x, y, z in m, roll, pitch, yaw in rad."""
     numbers = np.asarray(six, dtype=float)
     return frame(rotation_from_rpy(numbers[..., 3:]), numbers[..., :3])
 
 
 def xyzrpy_from_frame(a_T_b: ArrayLike) -> Array:
-    """Six numbers ``(..., 6)`` of frames ``(..., 4, 4)``; inverse of :func:`frame_from_xyzrpy`.
+    """Pose parameters ``(..., 6)`` of frames ``(..., 4, 4)``; inverse of :func:`frame_from_xyzrpy`.
 
     >>> base_T_tool = frame_from_xyzrpy([0.1, 0.2, 0.3, 0.0, 0.0, 0.5])
     >>> xyzrpy_from_frame(base_T_tool).round(9)
@@ -182,8 +182,6 @@ def transport_covariance(matrix: ArrayLike, covariance: ArrayLike) -> Array:
 
 def gram_schmidt_frame(points: ArrayLike) -> Array:
     """Frame from three points ``(..., 3, 3)``: origin in the first, x to the second, third in the x-y plane (y > 0).
-
-    Source: thesis section 5.4 (measuring body of three unknown targets).
 
     Raises
     ------

@@ -138,12 +138,13 @@ def _result(found: IdentifiedRobot, rows: Rows) -> dict[str, Any]:
             for name, e in found.eliminated.items()
         },
         "outliers": len(found.outliers),
+        "deficiency": found.deficiency or None,
         "correlated": [list(pair) for pair in found.strong_correlations()[:20]],
     }
 
 
 def _notes(found: IdentifiedRobot, poses: Poses, rows: Rows) -> list[str]:
-    notes = []
+    notes = [f"{poses.path}: {found.deficiency}"] if found.deficiency else []
     for i in found.outliers:
         name, error = poses.names[int(rows[i])], found.normalised[i]
         notes.append(f"pose '{name}' contradicts all others and was left out (normalised error {error:.1f})")

@@ -76,7 +76,7 @@ class CalibratedRobot:
     def predict(self, poses: PoseInputs) -> tuple[Array, Array]:
         """Tool frames (n, 4, 4) in the world and the covariance (n, 6, 6) of their right twist.
 
-        The covariance says how far the tool may be from where it is told: uncertainty of the parameters, and what
+        The covariance says how far the tool may be from where it is predicted: uncertainty of the parameters, and what
         moves the joints without being in the model. Weakness: all that is left counts as scatter of the joints, alike
         and independent from pose to pose.
         """

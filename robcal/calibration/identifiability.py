@@ -1,7 +1,7 @@
 """Which parameters to identify: order of preference, what is plausible, choice of elasticities by evidence, indices.
 
 Geometry: all deviations are candidates; those that others can replace, or that the data determine worse than anybody
-would doubt them anyway, are eliminated and named (:func:`robcal.estimation.dependence.split_dependent`).
+could guess them beforehand, are eliminated and named (:func:`robcal.estimation.dependence.split_dependent`).
 Elasticities are taken up only where the data ask for them, by F-tests on the identification poses: a needless one costs
 accuracy at other poses, a missing one too.
 """
@@ -46,7 +46,7 @@ TABLE_5_4 = (
     ("elastic_pitch", "pitch", "yaw", "elastic_yaw", "y", "z"),
     ("elastic_roll", "elastic_pitch", "pitch", "elastic_yaw", "yaw"),
 )
-"""The 30 parameters of the thesis' Table 5.4 by axis, for an arm with axes z, y, y, x, y, x."""
+"""A set of 30 parameters by axis that has proved itself for an arm with axes z, y, y, x, y, x."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ def choose_candidates(model: RobotModel, parameters: str | Sequence[str]) -> Can
     """Candidates of a choice 'standard', 'geometry', 'table5.4', or of named parameters.
 
     Base and tool are always among them. Order of preference within the geometry: base, tool, the joints' zero offsets,
-    then frame by frame from the base; so what remains ambiguous is told in terms of the outer frames.
+    then frame by frame from the base; so what remains ambiguous is reported in terms of the outer frames.
 
     Raises
     ------

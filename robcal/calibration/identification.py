@@ -2,7 +2,7 @@
 
 Start values by construction, whitening with the measured covariances, Gauss-Newton with halving line search, named
 elimination of dependent parameters, choice of elasticities by evidence, outlier poses, covariance and diagnostics.
-Sources: thesis chapter 5 for objective and solver; adjustment statistics after Foerstner and Wrobel (2016), chapter 4.
+Source of the adjustment statistics: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, chapter 4.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from robcal import transforms as tf
 from robcal.calibration.calibrated import CalibratedRobot
+from robcal.calibration.deficiency import describe_deficiency
 from robcal.calibration.identifiability import check_poses, choose_candidates, observability_indices
 from robcal.calibration.observations import FrameObservations, Observations, Stack, basis_points
 from robcal.calibration.outliers import PoseStatistics, find_outliers, pose_statistics
@@ -42,7 +43,7 @@ class IdentifyOptions:
     ----------
     parameters : 'standard', 'geometry', 'table5.4' or a list of names; base, tool and terms are always added.
     robust : leave out single poses that contradict all others (and report them).
-    objective : 'maximum_likelihood' (whitened with the measured covariance) or 'basis' (the thesis' norm).
+    objective : 'maximum_likelihood' (whitened with the measured covariance) or 'basis' (equal weights).
     statics : 'one_step' or 'converged'.
     joint_sigma : repeatability of the joints, rad or m, one number or one a joint; adds to the covariances.
     priors : standard deviations (around zero) by parameter name, for those that have one.
@@ -78,6 +79,7 @@ class IdentifiedRobot(CalibratedRobot):
     outliers : rows of poses left out; used : (n,) mask of the others.
     first_summary, summary : of the first iteration (from the start values) and of the last one, after the choice of
         parameters; iterations counts all Gauss-Newton steps; seconds : kernel, start and solution.
+    deficiency : why the poses cannot separate base and tool, with the remedy; empty where they do.
     """
 
     sigma0: float
@@ -99,8 +101,9 @@ class IdentifiedRobot(CalibratedRobot):
     first_summary: SolveSummary
     summary: SolveSummary
     iterations: int
-    seconds: float
-    seconds_kernel: float
+    seconds: float = 0.0
+    seconds_kernel: float = 0.0
+    deficiency: str = ""
 
     def strong_correlations(self, level: float = 0.95) -> list[tuple[str, str, float]]:
         """Pairs of parameters correlated more than ``level``, strongest first."""
@@ -162,7 +165,8 @@ def identify(
     final = engine.choose(first, weights) if choice.own_axis or choice.cross_axis else first
     if statistics is None or final is not first:
         statistics = pose_statistics(final, weights, stack)
-    return _result(engine, options, final, weights, outliers, statistics, clock, seconds_kernel)
+    result = _result(engine, options, final, weights, outliers, statistics)
+    return replace(result, seconds=time.perf_counter() - clock, seconds_kernel=seconds_kernel)
 
 
 def start_state(evaluator: Evaluator, observations: Sequence[Observations]) -> State:
@@ -175,7 +179,7 @@ def start_state(evaluator: Evaluator, observations: Sequence[Observations]) -> S
     kernel = evaluator.kernel
     cell = CellEvaluator(evaluator)
     theta = cell.theta
-    pairs = candidates(cell.base_T_flange, observations)
+    pairs = candidates(cell.base_T_flange, observations, kernel.model.flange_T_tool)
     if kernel.model.world_T_base is not None and kernel.model.flange_T_tool is not None:
         given = kernel.theta0
         pairs.append(
@@ -216,8 +220,6 @@ def _result(
     weights: Array,
     outliers: list[int],
     poses: PoseStatistics,
-    clock: float,
-    seconds_kernel: float,
 ) -> IdentifiedRobot:
     kernel, stack = engine.kernel, engine.stack
     r, J = solution.problem.linearise(solution.state)
@@ -233,14 +235,13 @@ def _result(
     sigma0, p_value = global_test(0.5 * float(r @ r), redundancy)
     scaled = options.covariance == "estimated" or (options.covariance == "auto" and p_value < 0.01)
     scale = sigma0**2 if scaled and redundancy > 0 else 1.0
-    state = solution.state
-    values = {n: float(v) for n, v in zip(kernel.names, state.theta, strict=True)}
-    model = replace(
-        kernel.model.with_parameters(values), world_T_base=state.world_T_base, flange_T_tool=state.flange_T_tool
-    )
+    used = weights > 0
+    flange = CellEvaluator(engine.evaluator).base_T_flange
+    sigma = dict(zip(solution.names, np.sqrt(scale * np.diag(statistics.cofactor)).tolist(), strict=True))
+    deficiency = describe_deficiency(kernel.model, engine.poses.q[used], flange[used], solution.eliminated, sigma)
     joint_sigma = np.sqrt(scale) * np.asarray(options.joint_sigma or 0.0, dtype=float)
     return IdentifiedRobot(
-        model=model,
+        model=_model_at(kernel, solution.state),
         names=solution.names,
         statics=options.statics,
         joint_sigma=joint_sigma.tolist(),
@@ -256,15 +257,22 @@ def _result(
         correlations=statistics.correlations,
         observability=observability_indices(statistics.singular_values),
         residuals=poses.residuals,
-        normalised=np.sqrt(poses.square),
+        normalised=np.sqrt(poses.mean_square),
         leverage=poses.leverage,
         redundancy_numbers=poses.redundancy,
         outliers=tuple(outliers),
-        used=weights > 0,
+        used=used,
+        deficiency=deficiency,
         options=options,
         first_summary=solution.first,
         summary=solution.summary,
         iterations=solution.iterations,
-        seconds=time.perf_counter() - clock,
-        seconds_kernel=seconds_kernel,
+    )
+
+
+def _model_at(kernel: Kernel, state: State) -> RobotModel:
+    """The kernel's robot with the parameters and references of a state."""
+    values = {n: float(v) for n, v in zip(kernel.names, state.theta, strict=True)}
+    return replace(
+        kernel.model.with_parameters(values), world_T_base=state.world_T_base, flange_T_tool=state.flange_T_tool
     )

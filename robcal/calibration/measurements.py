@@ -29,7 +29,7 @@ ASSUMED_SIGMA = 1e-4
 LEAST_SIGMA = 1e-7
 """Points that fit their body exactly, as calculated ones do, scatter by this (m)."""
 WEAK = 10.0
-"""A kept-out frame whose measurement is this many times less certain than usual says nothing about the robot."""
+"""A kept-out frame whose measurement is this many times less certain than the median says nothing about the robot."""
 
 
 @dataclass(frozen=True)

@@ -188,7 +188,7 @@ class PointObservations(_Rows):
 
 @dataclass(frozen=True)
 class SensorPointObservations(_Rows):
-    """Targets at rest in the world, measured by a sensor on the tool (thesis chapter 6).
+    """Targets at rest in the world, measured by a sensor on the tool.
 
     Attributes
     ----------
@@ -216,9 +216,9 @@ class SensorPointObservations(_Rows):
 
 @dataclass(frozen=True)
 class DistanceObservations(_Rows):
-    """Distances of the tool's origin from the world's origin, by draw-wire or interferometer (thesis chapter 7).
+    """Distances of the tool's origin from the world's origin, by draw-wire or interferometer.
 
-    The residual is ``d - |t|`` (maximum likelihood), not the thesis' ``d^2 - |t|^2``, which scatters by 2 d sigma.
+    The residual is ``d - |t|`` (maximum likelihood); ``d^2 - |t|^2`` would scatter by 2 d sigma.
 
     Attributes
     ----------
@@ -307,7 +307,7 @@ def _point_residuals(tool: Array, p_tool: Array, p_world: Array) -> tuple[Array,
 
 
 def basis_points(frames: FrameObservations, sigma: float | None = None) -> PointObservations:
-    """The thesis' basis norm (section 5.2): each frame as its images of the three unit vectors, equally weighted.
+    """Basis norm: each frame as its images of the three unit vectors, equally weighted.
 
     Weakness: it fixes the weight of angles against lengths (one metre of lever) whatever was measured how well.
     """

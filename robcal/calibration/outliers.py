@@ -36,11 +36,11 @@ class PoseStatistics:
     Attributes
     ----------
     residuals : (n, D) whitened; for poses left out they are predictions.
-    square : (n,) studentised mean squares (near one); leverage, redundancy : (n,).
+    mean_square : (n,) studentised mean squares (near one); leverage, redundancy : (n,).
     """
 
     residuals: Array
-    square: Array
+    mean_square: Array
     leverage: Array
     redundancy: Array
 
@@ -79,7 +79,7 @@ def find_outliers(engine: Engine, solution: Solution) -> tuple[list[int], Array,
     stack = engine.stack
     everything = np.ones(stack.n)
     all_in = solution, pose_statistics(solution, everything, stack)
-    suspects = suspicious(all_in[1].square, stack.used.sum(axis=1), everything)
+    suspects = suspicious(all_in[1].mean_square, stack.used.sum(axis=1), everything)
     weights, current = everything, all_in
     for _ in range(4):
         if not suspects or len(suspects) > max(1, LARGEST_SHARE * stack.n):
@@ -88,7 +88,7 @@ def find_outliers(engine: Engine, solution: Solution) -> tuple[list[int], Array,
         weights[suspects] = 0.0
         solution = engine.solve(solution.state, weights)
         current = solution, pose_statistics(solution, weights, stack)
-        now = suspicious(current[1].square, stack.used.sum(axis=1), weights)
+        now = suspicious(current[1].mean_square, stack.used.sum(axis=1), weights)
         if now == suspects:
             break
         suspects = now
@@ -111,7 +111,7 @@ def suspicious(square: Array, count: NDArray[np.int64], weights: Array) -> list[
     level = LEVEL / inside.sum()
     plain = special.chdtri(freedom, level) / special.chdtri(freedom, 0.5) * MARGIN
     quartile = special.ndtri(0.75)
-    usual = np.log(special.chdtri(freedom, 0.25) / special.chdtri(freedom, 0.5)) / quartile
+    expected = np.log(special.chdtri(freedom, 0.25) / special.chdtri(freedom, 0.5)) / quartile
     wide = np.exp(np.log(upper / typical) / quartile * -special.ndtri(level))
-    limit = np.where(np.log(upper / typical) / quartile > TAIL * usual, np.maximum(plain, wide), plain)
+    limit = np.where(np.log(upper / typical) / quartile > TAIL * expected, np.maximum(plain, wide), plain)
     return np.flatnonzero(measured & (relative > limit * typical)).tolist()

@@ -1,9 +1,9 @@
 """Measuring poses for an identification: as many as asked for, or as few as the wanted accuracy of the tool needs.
 
-Candidates that can be measured (:mod:`robcal.calibration.pose_candidates`) are chosen equidistant in joint space (the
-thesis' way, section 5.3) or by their information on the parameters (:mod:`robcal.calibration.pose_choice`), put into an
+Candidates that can be measured (:mod:`robcal.calibration.pose_candidates`) are chosen equidistant in joint space
+or by their information on the parameters (:mod:`robcal.calibration.pose_choice`), put into an
 order with short travel, and given approach directions that are balanced over the joints, so that backlash and
-hysteresis can be told from geometry.
+hysteresis can be distinguished from geometry.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class PoseRequest:
     verify : number of further poses, spread evenly, with which to verify.
     parameters : choice of parameters as for an identification.
     payload : name of the load carried, None for none.
-    sigma_px : px; accuracy of an image point (with cameras). sigma : (m, rad) accuracy of a measured frame beside that:
+    sigma_px : px; accuracy of an image point (with cameras). sigma : (m, rad) accuracy of a measured frame in addition:
         repeatability of the robot, or all there is without cameras.
     test_points : (k, 3) m, points in body coordinates whose accuracy counts.
     candidates : so many candidates to choose from; margin : share of the joint ranges to keep off the limits.

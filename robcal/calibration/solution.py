@@ -1,7 +1,7 @@
 """Which parameters, and their values: elimination of dependent ones, Gauss-Newton, choice of elasticities by evidence.
 
-Whether a parameter is dependent is told from the normal equations at a state, and again where the iteration ends, since
-deviations make some parameters visible that are dependent at nominal (parallel axes), and hide others.
+Whether a parameter is dependent is decided from the normal equations at a state, and again where the iteration ends,
+since deviations make some parameters visible that are dependent at nominal (parallel axes), and hide others.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ Array = NDArray[np.float64]
 
 LATE_SHARE = 0.2
 """Share of the plausible sigma below which a parameter may enter that was dependent at the start values."""
-CONCEIVABLE = 5.0
+PRIOR_SCALE = 5.0
 """Deviations that robots may have, as a standard deviation in units of the plausible ones."""
-USUAL_STEP = 2.5
-"""Steps of the iteration that are common, in units of the plausible deviations."""
+TRUST_SCALE = 2.5
+"""Size of the trust region of the iteration, in units of the plausible deviations."""
 MISFIT_LEVEL, MISFIT_SHARE = 1e-6, 0.25
 """Too much was eliminated if all candidates together would take more than this share off the expected sum of squares,
 and that is no chance (p-value)."""
@@ -53,12 +53,12 @@ class Normals:
 
     N: Array
     b: Array
-    square: float
+    sum_of_squares: float
 
     def shifted(self, back: Array) -> Normals:
         """For residuals from which the linear effect of going back by ``back`` (p,) is taken: ``r + J back``."""
         turned = self.N @ back
-        return Normals(self.N, self.b + turned, self.square + float(back @ (2.0 * self.b + turned)))
+        return Normals(self.N, self.b + turned, self.sum_of_squares + float(back @ (2.0 * self.b + turned)))
 
 
 class Engine:
@@ -81,7 +81,7 @@ class Engine:
         self.evaluator, self.choice = evaluator, choice
         self.joint_sigma, self.termination = joint_sigma, termination or TerminationSettings()
         self.kernel, self.poses, self.stack = evaluator.kernel, evaluator.poses, evaluator.stack
-        self.scatter, self.slack = 1.0, 1.0
+        self.scatter, self.patience = 1.0, 1.0
         self._whitened: tuple[State, Array] | None = None
         self._normals: tuple[State, Array, Normals] | None = None
         self._rules = limit_rules(self.kernel.model, choice.names)
@@ -112,7 +112,7 @@ class Engine:
                 problem.retract,
                 state,
                 self.termination,
-                USUAL_STEP * self._plausible(state, kept),
+                TRUST_SCALE * self._plausible(state, kept),
             )
             iterations += summary.iterations
             first = summary if first is None else first
@@ -129,7 +129,7 @@ class Engine:
             if round_ == 3 or (worse and not strict):
                 break
             if strict and round_ > 0:  # something that matters was left out as weak: look again with more patience
-                self.slack *= 10.0
+                self.patience *= 10.0
                 state = best[1].state
                 kept, eliminated = self._eliminate(state, names, weights)
                 continue
@@ -137,7 +137,7 @@ class Engine:
             # Only the first look adds any; later ones only take away, so nothing can go round in circles.
             again, eliminated = self._eliminate(state, names if round_ == 0 else kept, weights, eliminated)
             if again == kept and strict:
-                self.slack *= 10.0
+                self.patience *= 10.0
                 again, eliminated = self._eliminate(state, names, weights)
             if again == kept:
                 best = (worth, replace(best[1], eliminated=eliminated))
@@ -164,7 +164,7 @@ class Engine:
         n_own = sum(1 for k in optional if k < len(forced) + len(own))
         rows = self._rows(weights)
         N = at_zero.N[np.ix_(chosen_from, chosen_from)]
-        picked = choose_by_evidence(N, at_zero.b[chosen_from], at_zero.square, rows, len(forced), n_own)
+        picked = choose_by_evidence(N, at_zero.b[chosen_from], at_zero.sum_of_squares, rows, len(forced), n_own)
         taken = [names[optional[k]] for k in picked.taken]
         rejected = {names[k]: float(p) for k, p in zip(optional, picked.p_values, strict=True) if names[k] not in taken}
         state = self._moved(solution.state, (*forced, *taken), (*own, *cross), names, at_zero)
@@ -214,13 +214,13 @@ class Engine:
         trusted.
         """
         normals = self.normals(state, names, weights)
-        size = CONCEIVABLE * self._plausible(state, names)
+        size = PRIOR_SCALE * self._plausible(state, names)
         wide = ~np.isfinite(size)
         size[wide] = 1.0 / np.sqrt(np.maximum(np.diag(normals.N)[wide], 1e-300))
         scaled = normals.N * np.outer(size, size)
         factor = linalg.cho_factor(scaled + np.diag(np.where(wide, 1e-10, 1.0)), lower=True, check_finite=False)
         b = normals.b * size
-        left = max(0.0, normals.square - float(b @ linalg.cho_solve(factor, b, check_finite=False)))
+        left = max(0.0, normals.sum_of_squares - float(b @ linalg.cho_solve(factor, b, check_finite=False)))
         used = float(np.trace(linalg.cho_solve(factor, scaled, check_finite=False)))
         return max(1.0, float(np.sqrt(left / max(1.0, self._rows(weights) - used)))), left, used
 
@@ -236,7 +236,7 @@ class Engine:
             self._normals = (state, weights, Normals(J.T @ J, J.T @ r, float(r @ r)))
         every = self._normals[2]
         at = [self._at[n] for n in names]
-        N, b, square = every.N[np.ix_(at, at)], every.b[at], every.square
+        N, b, square = every.N[np.ix_(at, at)], every.b[at], every.sum_of_squares
         for k, column in enumerate(self.columns(names) if self.priors else ()):
             if column in self.priors:
                 sigma, value = self.priors[column], state.theta[column]
@@ -250,7 +250,7 @@ class Engine:
         return limits_at(self._rules[0][at], self._rules[1][at], self.evaluator(state).moments)
 
     def _limits(self, state: State, names: Sequence[str]) -> Array:
-        return self._plausible(state, names) * (self.slack / self.scatter)
+        return self._plausible(state, names) * (self.patience / self.scatter)
 
     def _eliminate(
         self, state: State, names: Sequence[str], weights: Array, before: Mapping[str, Eliminated] | None = None

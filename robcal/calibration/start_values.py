@@ -2,7 +2,7 @@
 
 - Frames: ``M_i = W T_i F`` for all poses. Rotations by the singular vectors of ``sum M_i (x) T_i`` (Li, Wang, Wu 2010,
   robot-world and hand-eye calibration by the Kronecker product), translations by linear least squares.
-- Points: three or more of a pose make a frame (thesis section 5.4). One target: ``p_i = R_W (R_i x + t_i) + t_W`` is
+- Points: three or more of a pose make a frame. One target: ``p_i = R_W (R_i x + t_i) + t_W`` is
   linear in R_W, its products with x, and t_W.
 - Distances: ``d^2`` is linear in x, the wire's origin and their products.
 - A sensor in the hand is a target at the mean measured point; its turn is found by trying 24 orientations.
@@ -37,35 +37,41 @@ PointRows = tuple[NDArray[Any], NDArray[Any], Array, Array]
 """Rows of points: pose, target, coordinates on the tool, coordinates in the world."""
 
 OUTLIER_FACTOR = 6.0
+LEAST_TURN = 2e-3
+"""RMS turn (rad) of the flange below which the place of the tool is not taken from the measurements."""
 
 
-def candidates(base_T_flange: Array, observations: Sequence[Observations]) -> list[Pair]:
+def candidates(
+    base_T_flange: Array, observations: Sequence[Observations], flange_T_tool: Array | None = None
+) -> list[Pair]:
     """Pairs (world_T_base, flange_T_tool) worth trying, best founded first; empty if nothing can be constructed.
 
     Parameters
     ----------
     base_T_flange : (n, 4, 4) of the nominal robot at the poses.
     observations : what was measured.
+    flange_T_tool : (4, 4) stated tool, whose place holds where the orientations leave it open; default the flange.
     """
+    near = np.zeros(3) if flange_T_tool is None else flange_T_tool[:3, 3]
     out: list[Pair] = []
     frames = _all_frames(observations)
     if frames is not None and len(frames[0]) >= 2:
         pose, measured = frames
         T = base_T_flange[pose]
-        pair = _trimmed_hand_eye(T, measured)
+        pair = _trimmed_hand_eye(T, measured, near)
         if pair is not None:
             return [pair]
         origin = measured[:, :3, 3]
-        for W, x in _one_target(T, origin):
+        for W, x in _one_target(T, origin, near):
             out.append((W, _with_turn(T, measured, W, x)))
         return out
     points = _all_points(observations)
     if points is not None:
-        out += _from_points(base_T_flange, *points)
+        out += _from_points(base_T_flange, *points, near)
     for o in observations:
         if isinstance(o, SensorPointObservations) and len(o.pose) >= 4:
             centre = o.p_sensor.mean(axis=0)
-            for W, x in _one_target(base_T_flange[o.pose], o.p_world):
+            for W, x in _one_target(base_T_flange[o.pose], o.p_world, near):
                 for R in _orientations():
                     out.append((W, tf.frame(R, x - R @ centre)))
         elif isinstance(o, DistanceObservations) and len(o.pose) >= 4 and not out:
@@ -73,12 +79,12 @@ def candidates(base_T_flange: Array, observations: Sequence[Observations]) -> li
     return out
 
 
-def hand_eye(T: Array, measured: Array) -> tuple[Pair, float]:
+def hand_eye(T: Array, measured: Array, near: Array | None = None) -> tuple[Pair, float]:
     """Closed form of ``measured = W T F``; also the ratio of the two largest singular values (near 1: ambiguous).
 
     Parameters
     ----------
-    T, measured : (n, 4, 4).
+    T, measured : (n, 4, 4). near : (3,) place of the tool where the orientations leave it open; default the flange.
     """
     K = np.einsum("nab,ncd->acbd", measured[:, :3, :3], T[:, :3, :3]).reshape(9, 9)
     U, s, Vt = np.linalg.svd(K)
@@ -89,33 +95,31 @@ def hand_eye(T: Array, measured: Array) -> tuple[Pair, float]:
     if np.linalg.det(R_F) < 0:
         R_F = -R_F
     R_W, R_F = _rotation(R_W), _rotation(R_F)
-    A = np.concatenate([R_W @ T[:, :3, :3], np.broadcast_to(np.eye(3), (len(T), 3, 3))], axis=2).reshape(-1, 6)
-    b = (measured[:, :3, 3] - T[:, :3, 3] @ R_W.T).ravel()
-    x = np.linalg.lstsq(A, b, rcond=1e-9)[0]
-    return (tf.frame(R_W, x[3:]), tf.frame(R_F, x[:3])), float(s[1] / max(s[0], 1e-300))
+    x, origin = _separate(R_W, T, measured[:, :3, 3], np.zeros(3) if near is None else near)
+    return (tf.frame(R_W, origin), tf.frame(R_F, x)), float(s[1] / max(s[0], 1e-300))
 
 
-def _trimmed_hand_eye(T: Array, measured: Array) -> Pair | None:
-    """Hand-eye solution without the poses that miss it by far more than the median; None if ambiguous."""
+def _trimmed_hand_eye(T: Array, measured: Array, near: Array) -> Pair | None:
+    """Hand-eye solution without the poses whose residual is far above the median; None if ambiguous."""
     rows = np.ones(len(T), dtype=bool)
     pair: Pair | None = None
     for _ in range(3):
-        (W, F), ratio = hand_eye(T[rows], measured[rows])
+        (W, F), ratio = hand_eye(T[rows], measured[rows], near)
         if ratio > 0.995:
             return None
         pair = (W, F)
-        miss = np.linalg.norm((W @ T @ F)[:, :3, 3] - measured[:, :3, 3], axis=1)
-        keep = miss <= OUTLIER_FACTOR * max(float(np.median(miss)), 1e-9)
+        residual = np.linalg.norm((W @ T @ F)[:, :3, 3] - measured[:, :3, 3], axis=1)
+        keep = residual <= OUTLIER_FACTOR * max(float(np.median(residual)), 1e-9)
         if np.array_equal(keep, rows) or keep.sum() < max(3, len(T) // 2):
             break
         rows = keep
     return pair
 
 
-def _one_target(T: Array, p: Array) -> list[tuple[Array, Array]]:
+def _one_target(T: Array, p: Array, near: Array) -> list[tuple[Array, Array]]:
     """Candidates (world_T_base, x) of ``p = W T x`` for one target x on the flange."""
     n, R, t = len(T), T[:, :3, :3], T[:, :3, 3]
-    starts = [np.zeros(3)]
+    starts = [near]
     if n >= 14:
         # per world axis a: p_a = sum_bc (W_ab x_c) R_bc + sum_b W_ab t_b + t_Wa
         A = np.concatenate([R.reshape(n, 9), t, np.ones((n, 1))], axis=1)
@@ -129,7 +133,7 @@ def _one_target(T: Array, p: Array) -> list[tuple[Array, Array]]:
     found: list[tuple[float, Array, Array]] = []
     for x in starts:
         try:
-            found.append(_alternate(R, t, p, x))
+            found.append(_alternate(T, p, x, near))
         except RobcalError:
             continue
         if found[-1][0] < 0.01 * max(reach, 1e-9):
@@ -138,19 +142,35 @@ def _one_target(T: Array, p: Array) -> list[tuple[Array, Array]]:
     return [(W, x) for _, W, x in found[:2]]
 
 
-def _alternate(R: Array, t: Array, p: Array, x: Array) -> tuple[float, Array, Array]:
-    """Fit W for fixed x and (x, t_W) for fixed turn in turn; returns the RMS miss, W, x."""
-    W, last, miss = np.eye(4), np.inf, np.inf
+def _alternate(T: Array, p: Array, x: Array, near: Array) -> tuple[float, Array, Array]:
+    """Fit W for fixed x and (x, t_W) for fixed turn in turn; returns the RMS residual, W, x."""
+    R, t = T[:, :3, :3], T[:, :3, 3]
+    W, last, residual = np.eye(4), np.inf, np.inf
     for _ in range(60):
         W = tf.fit_frame(p, t + R @ x)
-        A = np.concatenate([W[:3, :3] @ R, np.broadcast_to(np.eye(3), (len(R), 3, 3))], axis=2).reshape(-1, 6)
-        solution = np.linalg.lstsq(A, (p - t @ W[:3, :3].T).ravel(), rcond=1e-9)[0]
-        x, W = solution[:3], tf.frame(W[:3, :3], solution[3:])
-        miss = float(np.sqrt(np.mean((tf.transform(W, t + R @ x) - p) ** 2)))
-        if last - miss < 1e-3 * miss:
+        x, origin = _separate(W[:3, :3], T, p, near)
+        W = tf.frame(W[:3, :3], origin)
+        residual = float(np.sqrt(np.mean((tf.transform(W, t + R @ x) - p) ** 2)))
+        if last - residual < 1e-3 * residual:
             break
-        last = miss
-    return miss, W, x
+        last = residual
+    return residual, W, x
+
+
+def _separate(R_W: Array, T: Array, p: Array, near: Array) -> tuple[Array, Array]:
+    """Point x (3,) on the flange and world origin (3,) of ``p = R_W (R_i x + t_i) + t_W``, by linear least squares.
+
+    Along directions in which the flange turns less than :data:`LEAST_TURN`, x stays at ``near``.
+    """
+    A = R_W @ T[:, :3, :3]
+    b = p - T[:, :3, 3] @ R_W.T
+    centred = (A - A.mean(axis=0)).reshape(-1, 3)
+    size, least = float(np.linalg.norm(centred, 2)), LEAST_TURN * np.sqrt(len(T))
+    x = near
+    if size > least:
+        left = (b - b.mean(axis=0)).ravel() - centred @ near
+        x = near + np.linalg.lstsq(centred, left, rcond=least / size)[0]
+    return x, b.mean(axis=0) - A.mean(axis=0) @ x
 
 
 def _with_turn(T: Array, measured: Array, W: Array, x: Array) -> Array:
@@ -159,13 +179,15 @@ def _with_turn(T: Array, measured: Array, W: Array, x: Array) -> Array:
     return tf.frame(_rotation(turns.mean(axis=0)), x)
 
 
-def _from_points(base_T_flange: Array, pose: Array, target: Array, p_tool: Array, p_world: Array) -> list[Pair]:
+def _from_points(
+    base_T_flange: Array, pose: Array, target: Array, p_tool: Array, p_world: Array, near: Array
+) -> list[Pair]:
     out: list[Pair] = []
     ids, counts = np.unique(target, return_counts=True)
     places: dict[object, tuple[Array, Array]] = {}
     for main in ids[np.argsort(-counts)][:1]:
         rows = target == main
-        for W, _ in _one_target(base_T_flange[pose[rows]], p_world[rows]):
+        for W, _ in _one_target(base_T_flange[pose[rows]], p_world[rows], near):
             places.clear()
             for other in ids:
                 mine = target == other
@@ -202,9 +224,9 @@ def _from_distances(T: Array, d: Array) -> list[Pair]:
             x, c = x + step[:3], c + step[3:]
             if np.linalg.norm(step) < 1e-9:
                 break
-        miss = float(np.sqrt(np.mean((np.linalg.norm(t + R @ x - c, axis=1) - d) ** 2)))
-        found.append((miss, x, c))
-        if len(found) == 1 and miss < 0.005 * reach:
+        residual = float(np.sqrt(np.mean((np.linalg.norm(t + R @ x - c, axis=1) - d) ** 2)))
+        found.append((residual, x, c))
+        if len(found) == 1 and residual < 0.005 * reach:
             break
     found.sort(key=lambda f: f[0])
     return [(tf.frame(np.eye(3), -c), tf.frame(np.eye(3), x)) for _, x, c in found[:2]]

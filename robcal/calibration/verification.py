@@ -1,6 +1,6 @@
-"""How good a calibrated robot is where it was not identified: errors, honesty of the stated uncertainty, folds.
+"""How good a calibrated robot is where it was not identified: errors, calibration of the stated uncertainty, folds.
 
-Errors are those of the thesis' Table 5.1: ``e = |(measured - model) t|`` for test vectors t of 0, 490 and 980 mm on the
+Errors are ``e = |(measured - model) t|`` for test vectors t of 0, 490 and 980 mm on the
 tool, beside those of the nominal robot after the best fit of base and tool on the identification poses.
 """
 
@@ -36,7 +36,7 @@ TEST_VECTORS: Mapping[str, tuple[float, float, float]] = {
     "500": (0.2, 0.2, 0.4),
     "1000": (0.4, 0.4, 0.8),
 }
-"""Test vectors on the tool in m, by the names of the thesis' Table 5.1."""
+"""Test vectors on the tool in m, by their rounded length in mm."""
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ def fit_nominal(
 def tool_errors(T: Array, observations: Sequence[Observations]) -> dict[str, tuple[NDArray[np.int64], Array]]:
     """Rows of poses and errors (m) by test vector, for tool frames T (n, 4, 4) of the model.
 
-    Frames give all three vectors; points, distances and sensor points only '0' (the miss of what was measured).
+    Frames give all three vectors; points, distances and sensor points only '0' (the residual of what was measured).
     """
     out: dict[str, tuple[NDArray[np.int64], Array]] = {}
     frames = [o for o in observations if isinstance(o, FrameObservations)]
@@ -127,8 +127,8 @@ def tool_errors(T: Array, observations: Sequence[Observations]) -> dict[str, tup
         pose = np.concatenate([o.pose for o in frames])
         measured = np.concatenate([o.world_T_tool for o in frames])
         for name, vector in TEST_VECTORS.items():
-            miss = tf.transform(measured, vector) - tf.transform(T[pose], vector)
-            out[name] = (pose, np.linalg.norm(miss, axis=1))
+            error = tf.transform(measured, vector) - tf.transform(T[pose], vector)
+            out[name] = (pose, np.linalg.norm(error, axis=1))
         return out
     rows, errors = [], []
     for o in observations:

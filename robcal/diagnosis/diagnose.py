@@ -93,6 +93,7 @@ def diagnose(
         model=final.model.with_parameters({name: 0.0 for name in assumed if name not in final.free}),
         free=final.free,
         covariance=final.covariance[: len(final.free), : len(final.free)] * final.variance_factor,
+        notes=found.chosen.refused,
         next_poses=_next_poses(findings, found.chosen),
         seconds=time.perf_counter() - start,
         region=region_errors(whole, fit(case.model, whole, case.free), final)

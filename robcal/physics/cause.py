@@ -98,6 +98,7 @@ class LinearCause(Cause):
     ordered : constants with a long list of values of which the grid holds a part; refined among the values nearby.
     positive : prior probability that the amplitude is positive (one parameter only): things deflect and grow, rarely
         the reverse.
+    limits : lowest and highest amplitude that can be. first_must_show : whether the first one must be clear of zero.
     weight : prior weight (a kind that may act at many places shares one weight among them).
     covariates : variables that the law follows.
     default_prior : typical size of amplitudes whose number depends on the constants.
@@ -116,6 +117,8 @@ class LinearCause(Cause):
     continuous: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     ordered: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     positive: float = 0.5
+    limits: tuple[float, float] = (-np.inf, np.inf)
+    first_must_show: bool = False
     weight: float = 1.0
     covariates: tuple[str, ...] = ()
     default_prior: float = 1.5e-4
@@ -144,6 +147,11 @@ class LinearCause(Cause):
         """What makes the cause one of its kind; an axis may be dragged along by several others, so a coupling's
         driving axis belongs to it."""
         return (self.kind, self.where, self.direction, self.covariates if self.kind.several_drivers else ())
+
+    @property
+    def of_order(self) -> bool:
+        """Whether it is bound to the order or the time of the poses."""
+        return self.kind.of_order or not {"index", "time_s"}.isdisjoint(self.covariates)
 
     @property
     def acts_once(self) -> bool:

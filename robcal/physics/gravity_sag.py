@@ -23,6 +23,8 @@ KNOWN_TO_GIVE = 3.0
 """Prior weight of the sag about a joint's own axis: every joint gives way there, and every arm has weight."""
 ACROSS = 0.5
 """The same for both angles across the axis together."""
+LARGEST = 0.03
+"""rad: no arm that carries itself sags more."""
 MOST_LINKS = 4
 """Bodies behind a joint that are told apart; those farther out move with the last of them or are light."""
 
@@ -84,6 +86,7 @@ def _about(site: RobotSite, joint: Joint, angle: str, weight: float) -> RobotCau
         covariates=tuple(f"q{j.number}" for j in site.joints),
         weight=weight,
         default_prior=DEFLECTION,
+        limits=(-LARGEST, LARGEST),
     )
 
 

@@ -78,6 +78,8 @@ UPRIGHT_SHARE = 0.005
 """An axis whose torque is below this share of the moment on its bearings is upright: what torque the fit gives it comes
 from deviations of a few mrad, whose sign friction hides."""
 HIGHEST_RIPPLE_ORDER = 180
+LARGEST = np.radians(0.5)
+"""rad (or m): no gear, encoder or reference of a robot that works is off by more."""
 
 
 def _amplitude_phase(values: Array, factor: float) -> tuple[float, float]:
@@ -101,6 +103,7 @@ def _compliance(site: RobotSite, joint: Joint) -> Iterator[RobotCause]:
             positive=0.98,
             weight=KNOWN_TO_GIVE,
             free_parameters=(elastic,),
+            limits=(0.0, np.inf),
         )
 
 
@@ -177,6 +180,7 @@ def _backlash(site: RobotSite, joint: Joint) -> Iterator[RobotCause]:
         positive=0.97,
         bases=bases,
         covariates=(f"approach{k}", f"torque{k}"),
+        limits=(0.0, LARGEST),
     )
 
 
@@ -214,6 +218,7 @@ def _hysteresis(site: RobotSite, joint: Joint) -> Iterator[RobotCause]:
         positive=0.97,
         bases=lambda c: (Basis(joint.frame, "q", f"-0.5*approach{k}", "width"),),
         covariates=(f"approach{k}",),
+        limits=(0.0, LARGEST),
     )
 
 
@@ -235,6 +240,7 @@ def _lost_motion(site: RobotSite, joint: Joint) -> Iterator[RobotCause]:
         positive=0.7,
         bases=lambda c: (Basis(joint.frame, "q", f"tanh(torque{k}/torque_Nm)", "amplitude", c),),
         covariates=(f"torque{k}",),
+        limits=(-LARGEST, LARGEST),
     )
 
 
@@ -253,6 +259,7 @@ def _zero_jump(site: RobotSite, joint: Joint) -> Iterator[RobotCause]:
         ordered={"pose": every},
         bases=lambda c: (Basis(joint.frame, "q", "step(index - pose + 0.5)", "jump", c),),
         covariates=("index",),
+        limits=(-LARGEST, LARGEST),
     )
 
 
@@ -281,6 +288,7 @@ def _eccentricity(site: RobotSite, joint: Joint) -> Iterator[RobotCause]:
         grid=({"order": 1.0}, {"order": 2.0}),
         bases=lambda c: _harmonic(joint.number, joint.frame, "q", c["order"]),
         covariates=(f"q{joint.number}",),
+        limits=(-LARGEST, LARGEST),
     )
 
 
@@ -304,6 +312,7 @@ def _ripple(site: RobotSite, joint: Joint) -> Iterator[RobotCause]:
         grid=tuple({"order": float(o)} for o in range(3, HIGHEST_RIPPLE_ORDER + 1)),
         bases=lambda c: _harmonic(joint.number, joint.frame, "q", c["order"]),
         covariates=(f"q{joint.number}",),
+        limits=(-LARGEST, LARGEST),
     )
 
 

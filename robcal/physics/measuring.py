@@ -262,6 +262,7 @@ def _wire() -> Iterator[ObservationCause]:
         cause(WIRE_SAG, 2e-5, "g_per_m", 1.0, sag),
         report=lambda v, c: {"g_per_m": float(np.sqrt(max(v[0], 0.0))) * 1e3},
         positive=0.99,
+        limits=(0.0, np.inf),
     )
     yield cause(WIRE_STRETCH, 1e-4, "ppm_per_m", 1e6, lambda d: length(d) ** 2)
     yield cause(WIRE_SCALE, 3e-4, "ppm", 1e6, length)
@@ -274,7 +275,7 @@ def _wire() -> Iterator[ObservationCause]:
         1e3,
         lambda d: -np.arctan2(d.p_world[:, 2], np.hypot(d.p_world[:, 0], d.p_world[:, 1])),
     )
-    yield replace(wrap, positive=0.99)
+    yield replace(wrap, positive=0.99, limits=(0.0, 0.5))
 
 
 def _sensor(data: ObservationData, body: str) -> Iterator[ObservationCause]:

@@ -96,6 +96,8 @@ def _bent_sight(data: ObservationData, axis: int) -> ObservationCause:
         report,
         observation_shift=_warping(bent),
         weight=0.125,
+        limits=(-1e-3, 1e-3),
+        first_must_show=True,
     )
 
 

@@ -73,6 +73,7 @@ def _link_compliance(site: RobotSite, joint: Joint) -> Iterator[RobotCause]:
             positive=0.95,
             free_parameters=(name,),
             covariates=(f"{identifier(joint.frame)}_m{angle}",),
+            limits=(0.0, np.inf),
         )
 
 
@@ -200,6 +201,7 @@ def _base(site: RobotSite) -> Iterator[RobotCause]:
                 Basis("base", "pitch", "base_my", "compliance"),
             ),
             covariates=("base_mx", "base_my"),
+            limits=(0.0, np.inf),
         )
     first, every = breaks(site.variables["index"], 3)
     kinds = ("x", "y", "z", "roll", "pitch", "yaw")
@@ -253,6 +255,7 @@ def _payloads(site: RobotSite) -> Iterator[RobotCause]:
             (max(0.15 * payload.mass, 0.5),),
             _mass_report(payload.mass),
             free_parameters=(mass_name,),
+            limits=(-payload.mass, np.inf),
         )
         cog_names = tuple(f"payload.{name}.{axis}" for axis in "xyz")
         yield RobotCause(
@@ -263,6 +266,7 @@ def _payloads(site: RobotSite) -> Iterator[RobotCause]:
             (0.1, 0.1, 0.1),
             _cog_report(np.array(payload.cog)),
             free_parameters=cog_names,
+            limits=(-1.0, 1.0),
         )
 
 

@@ -1,6 +1,7 @@
 """What to command so that the real robot's tool comes where it is wanted.
 
-Source of the first-order command: thesis section 3.6. With the nominal inverse ``K^-1`` and the real forward model
+The first-order command is one step of an iterative correction of the target (Veitschegger and Wu 1988, Robot
+calibration and compensation). With the nominal inverse ``K^-1`` and the real forward model
 ``Kr`` (geometry, elasticity under the payload, all extra terms): ``Fh = Kr(K^-1(F))``, ``F* = F Fh^-1 F``, command
 ``K^-1(F*)``. It is exact if real and nominal robot differ by one constant frame on one side. The exact inverse repeats
 the step on its own result, ``F* <- F* Fh^-1 F``, until the real model is at F; each round gains about the factor by

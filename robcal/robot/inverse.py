@@ -28,7 +28,7 @@ EXPLAINED = 25
 
 UNEXPLAINED = "out of reach or beyond a joint limit"
 
-_LIMIT_SLACK = 1e-9
+_LIMIT_TOLERANCE = 1e-9
 
 
 @dataclass(frozen=True)
@@ -170,7 +170,7 @@ def explain_unreachable(solutions: InverseSolutions, row: int) -> str:
         worst = np.max(np.abs(solutions.excess[row, branches]), axis=1)
         k = branches[int(np.argmin(worst))]
         parts = []
-        for j in np.flatnonzero(np.abs(solutions.excess[row, k]) > _LIMIT_SLACK):
+        for j in np.flatnonzero(np.abs(solutions.excess[row, k]) > _LIMIT_TOLERANCE):
             amount = solutions.excess[row, k, j]
             text = f"{1e3 * abs(amount):.2f} mm" if chain.prismatic[j] else f"{np.rad2deg(abs(amount)):.2f} deg"
             side = "above its upper" if amount > 0 else "below its lower"
@@ -236,7 +236,7 @@ def _closed_form(chain: Chain, structure: Structure, frames: Array, near: Array)
 
 
 def _polish(chain: Chain, frames: Array, q: Array) -> Array:
-    """Newton steps where the true chain misses the closed form's structure; branches that don't hold become NaN."""
+    """Newton steps where the chain departs from the closed form's structure; branches that don't hold become NaN."""
     n, branches, _ = q.shape
     out = q.copy()
     rows, cols = np.nonzero(np.all(np.isfinite(q), axis=-1))
@@ -271,7 +271,7 @@ def _turn_near(chain: Chain, q: Array, near: Array) -> tuple[Array, Array]:
     turn = 2.0 * np.pi
     rotary = ~chain.prismatic
     best = np.where(rotary, q - turn * np.round((q - near) / turn), q)
-    high, low = best - chain.upper - _LIMIT_SLACK, chain.lower - _LIMIT_SLACK - best
+    high, low = best - chain.upper - _LIMIT_TOLERANCE, chain.lower - _LIMIT_TOLERANCE - best
     turns = np.where(rotary & (high > 0), -np.ceil(high / turn), np.where(rotary & (low > 0), np.ceil(low / turn), 0.0))
     moved = best + turn * turns
     excess = limit_excess(chain, moved)
@@ -281,7 +281,7 @@ def _turn_near(chain: Chain, q: Array, near: Array) -> tuple[Array, Array]:
 
 
 def _respects(q: Array, excess: Array) -> BoolArray:
-    return np.all(np.isfinite(q), axis=-1) & np.all(np.abs(np.nan_to_num(excess)) <= _LIMIT_SLACK, axis=-1)
+    return np.all(np.isfinite(q), axis=-1) & np.all(np.abs(np.nan_to_num(excess)) <= _LIMIT_TOLERANCE, axis=-1)
 
 
 def _finish(chain: Chain, frames: Array, near: Array, q: Array, method: str) -> InverseSolutions:

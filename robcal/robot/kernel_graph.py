@@ -6,7 +6,7 @@ D directly and S dm by way of the moments. So ``J = G D + (G S) dm/dtheta``: onl
 automatic differentiation, G and the moments' derivatives from mechanics. That keeps the graph ten times smaller than
 differentiating the chain.
 
-Statics 'one_step': moments of the chain before it gives way, as in the thesis (section 3.4). 'converged': the fixed
+Statics 'one_step': moments of the undeflected chain. 'converged': the fixed
 point, unrolled; each round gains the factor elasticity * load, about 1e-2 for soft robots.
 """
 

@@ -122,7 +122,7 @@ class RobotModel:
 
     Raises
     ------
-    InvalidInput : names, numbers or kinds that contradict the contract; the message says which.
+    InvalidInput : names, numbers or kinds that a robot cannot have; the message says which.
     """
 
     name: str
@@ -264,6 +264,6 @@ def _check(model: RobotModel) -> None:
     known = set(parameter_names(model))
     for name, value in model.parameters.items():
         if name not in known:
-            raise InvalidInput(f"{where}: unknown parameter '{name}'; names are <frame>.<kind>, see the contract")
+            raise InvalidInput(f"{where}: unknown parameter '{name}'; names are <frame>.<kind>")
         if not math.isfinite(value):
             raise InvalidInput(f"{where}: parameter '{name}' is not finite")

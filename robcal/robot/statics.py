@@ -1,8 +1,9 @@
 """Static moments of the weights along a chain, and their exact derivatives, as CasADi graphs.
 
 The moment about a line through ``o`` with direction ``z`` of all weights behind it is ``m = z . ((P - M o) x g)`` with
-``M`` the sum of masses behind and ``P`` their first moment: the recursion of the thesis (section 3.4) with the weights
-summed first. Everything is written in base coordinates, so only one gravity vector is needed.
+``M`` the sum of masses behind and ``P`` their first moment: the static part of the recursion
+of Luh, Walker and Paul (1980) with the weights summed first. Everything is written in base coordinates, so only one
+gravity vector is needed.
 
 The moment is the negative derivative of the potential energy by the angle, so its derivatives by the coordinates form a
 symmetric matrix: with ``F_b`` the derivative of the first moment by coordinate b, and b not before a in the chain,
@@ -34,7 +35,7 @@ class LocalFrame:
 
 
 def local_frame(six: ca.SX) -> LocalFrame:
-    """Frame of six numbers x, y, z, roll, pitch, yaw: ``R = Rz(yaw) Ry(pitch) Rx(roll)``."""
+    """Frame of a pose x, y, z, roll, pitch, yaw: ``R = Rz(yaw) Ry(pitch) Rx(roll)``."""
     R, line = _rotation()(six[3:])
     return LocalFrame(six[:3], R, line)
 

@@ -19,6 +19,7 @@ from robcal.diagnosis.scan.family_wise import FamilyWise
 from robcal.diagnosis.scan.posterior import refine
 from robcal.diagnosis.scan.statistics import orthonormal_basis
 from robcal.diagnosis.scan.tangents import Laws
+from robcal.diagnosis.search.admissible import possible, refusal
 from robcal.physics.cause import Array, Constants, Key, LinearCause
 from robcal.physics.prior_scale import prior_scale
 from robcal.robot.model import RobotModel
@@ -56,7 +57,7 @@ class SelectionSettings:
     blunder_share: float = 0.1
     runs: int = 400
     least_kept: float = 0.5
-    most_futile: int = 4
+    most_futile: int = 6
 
 
 @dataclass(frozen=True)
@@ -72,6 +73,7 @@ class Selection:
     free, tied : fitted and eliminated parameters at the end.
     blunders : observations left out: (index in the recording given, its pose's row).
     without : with several causes, analyses at the fits without one of them each, in their order.
+    refused : why causes that fit were not accepted.
     """
 
     recording: Recording
@@ -83,6 +85,7 @@ class Selection:
     tied: frozenset[str]
     blunders: tuple[tuple[int, int], ...]
     without: tuple[Analysis, ...] = ()
+    refused: tuple[str, ...] = ()
 
 
 DEFAULTS = SelectionSettings()
@@ -104,7 +107,7 @@ def select(
     number = np.arange(len(recording.observations.pose))
     most_blunders = int(settings.blunder_share * len(number))
     first: Analysis | None = None
-    barred: set[Key] = set()
+    barred: dict[Key, str] = {}
     without: tuple[Analysis, ...] = ()
     settled, weighed = False, True
     present = fit(model, recording, free)
@@ -140,6 +143,13 @@ def select(
             recording, present = _weighed(model, recording, free, trial)
             p_values.append(analysis.p_value)
             continue
+        impossible = [k for k, item in enumerate(present.accepted) if not possible(item, present)]
+        if impossible:  # beside the others a cause may have become what cannot be
+            barred[accepted[impossible[0]].cause.key] = ""
+            accepted = tuple(item for k, item in enumerate(accepted) if k != impossible[0])
+            del p_values[impossible[0]]
+            present = fit(model, recording, free, accepted)
+            continue
         if settled or len(accepted) < 2:
             break
         settled = True
@@ -149,8 +159,9 @@ def select(
         if without:
             break
         present = fit(model, recording, free, accepted)
+    refused = tuple(reason for reason in barred.values() if reason)
     return Selection(
-        recording, present.accepted, tuple(p_values), first, analysis, free, tied, tuple(left_out), without
+        recording, present.accepted, tuple(p_values), first, analysis, free, tied, tuple(left_out), without, refused
     )
 
 
@@ -175,11 +186,12 @@ def _extended(
     recording: Recording,
     free: tuple[str, ...],
     analysis: Analysis,
-    barred: set[Key],
+    barred: dict[Key, str],
     settings: SelectionSettings,
     tell: Callable[[str], None],
 ) -> Fit | None:
-    """The fit with the best cause added; causes whose refit does not keep the linear promise are barred."""
+    """The fit with the best cause added; causes whose refit does not keep the linear promise, or that are refused, are
+    barred, with the reason."""
     for _ in range(settings.most_futile):
         open_to = np.array([cause.key not in barred for cause in analysis.causes])
         choice = choose(analysis, open_to, settings.level)
@@ -190,9 +202,13 @@ def _extended(
         trial = fit(model, recording, free, (*analysis.fit.accepted, added))
         gain = float(analysis.fit.residual @ analysis.fit.residual - trial.residual @ trial.residual)
         if gain > settings.least_kept * promised(analysis, added):
-            tell(f"{added.cause.name} at {added.cause.where}: p {analysis.p_value:.2g}")
-            return trial
-        barred.add(added.cause.key)
+            reason = refusal(trial.accepted[-1], analysis.fit, trial, analysis.at)
+            if reason is None:
+                tell(f"{added.cause.name} at {added.cause.where}: p {analysis.p_value:.2g}")
+                return trial
+            barred[added.cause.key] = reason
+        else:
+            barred[added.cause.key] = ""
     return None
 
 

@@ -30,7 +30,7 @@ static int inside(const double *q)
 {
     int i;
     for (i = 0; i < N; ++i) {
-        if (!(q[i] <= UPPER[i] + SLACK && q[i] >= LOWER[i] - SLACK)) {
+        if (!(q[i] <= UPPER[i] + LIMIT_TOLERANCE && q[i] >= LOWER[i] - LIMIT_TOLERANCE)) {
             return 0;
         }
     }

@@ -3,7 +3,7 @@
 #include "robot_data.h"
 
 #define TURN 6.28318530717958647693
-#define SLACK 1e-9
+#define LIMIT_TOLERANCE 1e-9
 #define EDGE 1e-9
 
 static double dot(const double *a, const double *b)
@@ -101,15 +101,15 @@ static int turn_near(double *q, const double *near)
         if (!PRISMATIC[i]) {
             double high, low;
             q[i] -= TURN * floor((q[i] - near[i]) / TURN + 0.5);
-            high = q[i] - UPPER[i] - SLACK;
-            low = LOWER[i] - SLACK - q[i];
+            high = q[i] - UPPER[i] - LIMIT_TOLERANCE;
+            low = LOWER[i] - LIMIT_TOLERANCE - q[i];
             if (high > 0.0) {
                 q[i] -= TURN * ceil(high / TURN);
             } else if (low > 0.0) {
                 q[i] += TURN * ceil(low / TURN);
             }
         }
-        if (q[i] > UPPER[i] + SLACK || q[i] < LOWER[i] - SLACK) {
+        if (q[i] > UPPER[i] + LIMIT_TOLERANCE || q[i] < LOWER[i] - LIMIT_TOLERANCE) {
             inside = 0;
         }
     }

@@ -1,0 +1,118 @@
+"""What may not be accepted however well it fits: impossible sizes, times that are patterns of poses, no gain.
+
+A cause must be possible by its sign and size; one bound to the time or the order of the poses must not follow what
+else changes from pose to pose; and it must gain on poses kept out in blocks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from robcal.diagnosis.core.fitting import Accepted, Fit, solve
+from robcal.diagnosis.core.recording import Recording
+from robcal.diagnosis.gain.heldout import folds
+from robcal.diagnosis.scan.tangents import Tangents
+from robcal.physics.cause import Array
+
+CONFOUNDED = 0.8
+"""Share of a pattern over time that the poses may explain."""
+RESTING = 1e-6
+"""A joint that differs less than this (rad, m) from where it mostly is rests there."""
+LEAST_REST = 0.15
+"""Share of the poses in which a joint must rest at one place for its setting out to be a pattern."""
+SURE = 2.0
+"""Change of a fold's sum of squares, in units of the variance factor, that counts for or against a cause."""
+
+
+def refusal(item: Accepted, before: Fit, after: Fit, at: Tangents) -> str | None:
+    """Why a cause is not accepted although it fits; None if it may be.
+
+    Parameters
+    ----------
+    item : the cause as fitted. before, after : fits without and with it. at : tangents of the first.
+    """
+    cause = item.cause
+    if not possible(item, after):
+        return f"{cause.describe(cause.report(item.values, item.constants))}, which cannot be"
+    if cause.of_order:
+        if not cause.kind.named:
+            return f"something at {cause.where} follows the order or the time of the poses, which is no law of a robot"
+        together = confounded_with(item, at)
+        if together:
+            return (
+                f"{cause.kind.words} at {cause.where} cannot be told from what follows {together}, which changes at "
+                "the same time: repeat some of the first poses at the end"
+            )
+        return None
+    if not gains(before, after, at.recording):
+        return f"{cause.kind.words} at {cause.where} does not gain on blocks of poses that are kept out"
+    return None
+
+
+def possible(item: Accepted, fitted: Fit) -> bool:
+    """Whether the amplitudes have signs and sizes that physics allows, and the first one is known at all."""
+    low, high = item.cause.limits
+    if not np.all((item.values >= low) & (item.values <= high)):
+        return False
+    if not item.cause.first_must_show:
+        return True
+    return bool(abs(item.values[0]) > SURE * np.sqrt(item.covariance[0, 0] * fitted.variance_factor))
+
+
+def confounded_with(item: Accepted, at: Tangents) -> str:
+    """What changes from pose to pose as a cause over time does: `axisK`, a payload; empty where nothing does.
+
+    A joint that rests and sets out, or a load that is changed, at the time of a jump explains it as well.
+    """
+    pattern = _pattern(item, at)
+    pattern = pattern - np.mean(pattern)
+    for name, column in _settings(at.recording).items():
+        other = column - np.mean(column)
+        size = float((other @ other) * (pattern @ pattern))
+        if size > 0 and float(other @ pattern) ** 2 > CONFOUNDED * size:
+            return name
+    return ""
+
+
+def _pattern(item: Accepted, at: Tangents) -> Array:
+    """The course (n,) of a cause over the poses: zero before and one after a jump, or the value of its law."""
+    if "pose" in item.constants:
+        return np.asarray(at.recording.covariates["index"] >= item.constants["pose"] - 0.5, dtype=float)
+    laws = item.cause.laws(item.constants)
+    return at.laws.value(laws[0], at.variables) if laws else np.asarray(at.recording.covariates["index"])
+
+
+def _settings(recording: Recording) -> Mapping[str, Array]:
+    """Columns (n,) that tell in which poses a joint is away from where it rests, or the robot carries a load."""
+    out: dict[str, Array] = {}
+    for k in range(recording.q.shape[1]):
+        places, number, times = np.unique(
+            np.round(recording.q[:, k] / RESTING), return_inverse=True, return_counts=True
+        )
+        if len(places) > 1 and times.max() >= LEAST_REST * len(number):
+            out[f"axis{k + 1}"] = (number != int(np.argmax(times))).astype(float)
+    for payload in set(recording.payload) if len(set(recording.payload)) > 1 else ():
+        out[f"payload {payload}"] = np.array([p == payload for p in recording.payload], dtype=float)
+    return out
+
+
+def gains(before: Fit, after: Fit, recording: Recording) -> bool:
+    """Whether most blocks of poses that say anything are predicted better by a fit to all others with the cause."""
+    label = folds(recording)[before.row_pose]
+    change = _kept_out(before, label) - _kept_out(after, label)
+    unit = SURE * after.variance_factor
+    return bool(change.sum() > 0 and np.sum(change > unit) >= np.sum(change < -unit))
+
+
+def _kept_out(fitted: Fit, label: Array) -> Array:
+    """Sum of squares (folds,) of each fold's whitened residuals, predicted from the others to first order."""
+    out = []
+    for fold in np.unique(label):
+        test = label == fold
+        rows = np.vstack([fitted.jacobian[~test], fitted.prior])
+        step = solve(rows, np.concatenate([fitted.residual[~test], fitted.prior_residual]))
+        left = fitted.residual[test] - fitted.jacobian[test] @ step
+        out.append(float(left @ left))
+    return np.array(out)
