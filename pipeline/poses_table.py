@@ -84,7 +84,7 @@ def read_poses(path: Path, robot: RobotModel | None, payloads: Collection[str], 
         payload=parse_payload(table, payloads),
         verify=_verify(table),
         approach=approach,
-        approach_inferred=inferred,
+        inferred=inferred,
         covariates=_covariates(table, known, notes),
         notes=tuple(notes),
         outside=_outside(table, robot, q),
@@ -158,7 +158,7 @@ def _verify(table: Table) -> NDArray[np.bool_]:
     return np.array([cell == "verify" for cell in table.columns["set"]])
 
 
-def _approach(table: Table, q: Array, to_predict: bool, notes: list[str]) -> tuple[Array, bool]:
+def _approach(table: Table, q: Array, to_predict: bool, notes: list[str]) -> tuple[Array, tuple[int, ...]]:
     columns = [f"approach{k}" for k in range(1, q.shape[1] + 1)]
     given = [name in table.columns for name in columns]
     if to_predict:
@@ -176,7 +176,7 @@ def _approach(table: Table, q: Array, to_predict: bool, notes: list[str]) -> tup
                 i = int(np.argmax(bad))
                 raise table.error(i, f"{name} is {table.columns[name][i]}, it must be -1, 0 or +1")
             approach[:, k] = values
-    return approach, not to_predict and not all(given)
+    return approach, () if to_predict else tuple(k for k, there in enumerate(given) if not there)
 
 
 def _covariates(table: Table, known: set[str], notes: list[str]) -> dict[str, Array]:

@@ -103,11 +103,7 @@ def _robot(material: Material, v: Verification) -> Verdict:
 
 
 def _taken_out(material: Material, v: Verification) -> str:
-    """What was taken out of the measured frames before they were compared, and how far the prediction is to be trusted.
-
-    Errors that all poses share (place and lens of the cameras, coordinates of the body) do not show in the comparison;
-    the predicted standard deviation holds them.
-    """
+    """Faults of the measuring system that were found, and how far the prediction is to be trusted."""
     freed = material.find(CORRECTED)
     if freed is None or material.identification is None:
         return ""
@@ -120,8 +116,8 @@ def _taken_out(material: Material, v: Verification) -> str:
         return ""
     moved, sigma = (1e3 * float(np.sqrt(np.mean(x**2))) for x in (np.concatenate(shifts), v.predicted))
     return (
-        f" Errors of the measuring system that were estimated from all poses together ({number(moved, 2)} mm RMS) are "
-        f"taken out of this comparison; with them, a predicted place is known to {number(sigma, 2)} mm a direction."
+        f" Faults of the measuring system that were found ({number(moved, 2)} mm RMS) are in these errors; the "
+        f"region is judged without them. A predicted place is known to {number(sigma, 2)} mm a direction."
     )
 
 

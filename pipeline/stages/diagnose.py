@@ -18,7 +18,7 @@ from robcal.diagnosis.content import diagnosis_content, with_images
 from robcal.diagnosis.core.result import Diagnosis
 from robcal.diagnosis.images.diagnosis import ImageFinding
 from robcal.diagnosis.search.selection import SelectionSettings
-from robcal.recipe.robot_diagnosis import Measured, diagnose_robot
+from robcal.recipe.robot_diagnosis import Measured, RobotDiagnosis, diagnose_robot
 from robcal.recipe.robot_witness import with_station_moves
 
 NAME = "diagnose"
@@ -44,6 +44,7 @@ def work(context: Context) -> Outcome:
     content = with_images(diagnosis_content(diagnosis), images.findings, images.scans, images.noise)
     if station is not None and found.recording.own_station:
         content = with_station_moves(content, station.names, found.recording, diagnosis.model)
+    content = content | _in_force(found)
     write_json(run.diagnosis, content)
     outputs = [run.diagnosis, run.save(artifacts.CALIBRATED, found.robot), run.save(artifacts.EVIDENCE, found.evidence)]
     if content.get("next_poses"):
@@ -55,9 +56,23 @@ def work(context: Context) -> Outcome:
         outputs.append(run.save(artifacts.CORRECTED, found.corrected))
     told = [f.statement for f in images.findings] + [f.statement for f in diagnosis.findings]
     notes = told or ["nothing missing: the model explains the data"]
-    outcome = _result(diagnosis) | {"mismatch": content["mismatch"]}
+    if diagnosis.findings:
+        notes = [*notes, found.in_force.reason]
+    outcome = _result(diagnosis) | {"mismatch": content["mismatch"]} | _in_force(found)
     outcome["causes"] = [*_named(images.findings), *_result(diagnosis)["causes"]]
     return Outcome({"diagnosis": outcome}, outputs, notes)
+
+
+def _in_force(found: RobotDiagnosis) -> dict[str, Any]:
+    """Whether what was found is in the robot that is delivered, and the errors over folds that decided it."""
+    if not found.diagnosis.findings:
+        return {"in_force": False, "in_force_reason": found.in_force.reason}
+    decided = found.in_force
+    return {
+        "in_force": decided.diagnosed,
+        "in_force_reason": decided.reason,
+        "delivered_mm": {"identified": 1e3 * decided.identified, "diagnosed": 1e3 * decided.diagnosed_error},
+    }
 
 
 def settings_of(campaign: Campaign) -> SelectionSettings:

@@ -15,6 +15,7 @@ from pipeline.robot_file import write_robot
 from pipeline.runs import Run
 from pipeline.stages.base import Context, Outcome, Stage, no_files
 from pipeline.stages.identify import load_calibrated, options_of, require_robot
+from pipeline.stages.survey import located
 from pipeline.tables import write_table
 from robcal.calibration.calibrated import CalibratedRobot
 from robcal.calibration.measurements import RobotObservations
@@ -26,13 +27,16 @@ from robcal.calibration.observations import (
     SensorPointObservations,
 )
 from robcal.calibration.verdict import verdict
-from robcal.calibration.verification import ErrorStatistics, Verification
+from robcal.calibration.verification import ErrorStatistics
+from robcal.errors import InvalidInput
 from robcal.recipe.noise import noise_of
 from robcal.recipe.verdict import robot_facts
-from robcal.recipe.verification import verify_robot
+from robcal.recipe.verification import RobotVerification, datum_note, verify_robot
 from robcal.robot.model import parameter_unit
 
 NAME = "verify"
+PAYS = 0.95
+"""Share of the error that has to be left for approach directions to be worth stating."""
 
 
 def work(context: Context) -> Outcome:
@@ -41,22 +45,43 @@ def work(context: Context) -> Outcome:
     robot, poses = require_robot(campaign)
     identification = run.load(artifacts.IDENTIFICATION)
     calibrated = load_calibrated(run)
+    diagnosed = run.record("diagnose") is not None
     # what the diagnosis found in the measuring system is no error of the robot
-    freed = run.find(artifacts.CORRECTED)
-    relative = run.find(artifacts.RELATIVE_COVARIANCE) if freed is not None else None
+    freed = run.find(artifacts.CORRECTED) if diagnosed else None
+    relative = run.find(artifacts.RELATIVE_COVARIANCE) if diagnosed else None
     options = options_of(campaign, identification.recording.stated)
-    outcome, tested, notes = verify_robot(robot, identification, calibrated, poses, options, freed, relative)
+    try:
+        found = verify_robot(robot, identification, calibrated, poses, options, freed, relative)
+    except InvalidInput as error:
+        raise located(error, str(poses.path)) from None
     write_robot(run.robot, calibrated.model, f"calibrated from campaign {campaign.name}")
     _write_covariance(run, calibrated)
-    _write_residuals(run, poses, calibrated, (freed or identification.recording).observations)
-    outputs = [run.save(artifacts.VERIFICATION, (outcome, tested)), run.robot, run.covariance, run.residuals]
-    diagnosis = read_json(run.diagnosis) if run.record("diagnose") is not None and run.diagnosis.is_file() else None
-    facts = robot_facts(identification, calibrated, poses, outcome, diagnosis, doubtful_coordinates(run))
-    found = verdict(facts)
-    told = {"grade": found.grade, "text": found.text, "reasons": list(found.reasons)}
+    _write_residuals(run, poses, calibrated, identification.recording.observations)
+    outputs = [
+        run.save(artifacts.VERIFICATION, (found.delivered, found.rows)),
+        run.robot,
+        run.covariance,
+        run.residuals,
+    ]
+    notes = [*found.notes, *_approach_note(found), *filter(None, [datum_note(identification, calibrated, poses)])]
+    diagnosis = read_json(run.diagnosis) if diagnosed and run.diagnosis.is_file() else None
+    judged = verdict(
+        robot_facts(identification, calibrated, poses, found.delivered, diagnosis, doubtful_coordinates(run))
+    )
+    told = {"grade": judged.grade, "text": judged.text, "reasons": list(judged.reasons)}
     noise = noise_of(identification, calibrated, poses)
-    result = {"verification": _result(outcome), "noise": _noise_result(noise), "verdict": told}
+    result = {"verification": _result(found), "noise": _noise_result(noise), "verdict": told}
     return Outcome(result, outputs, [*notes, *noise.notes])
+
+
+def _approach_note(found: RobotVerification) -> list[str]:
+    """What stating approach directions would gain."""
+    if found.recorded is None:
+        return []
+    before, after = (1e3 * v.tools["0"].rms for v in (found.delivered, found.recorded))
+    if after > PAYS * before:
+        return []
+    return [f"state approach: {before:.3f} -> {after:.3f} mm RMS at the kept-out poses"]
 
 
 def _noise_result(noise: NoiseParts) -> dict[str, Any]:
@@ -122,10 +147,14 @@ def _statistics(tools: Mapping[str, ErrorStatistics]) -> dict[str, dict[str, flo
     return {name: {key: value * 1000 for key, value in vars(errors).items()} for name, errors in tools.items()}
 
 
-def _result(outcome: Verification) -> dict[str, Any]:
+def _result(found: RobotVerification) -> dict[str, Any]:
+    outcome = found.delivered
+    delivered = _statistics(outcome.tools)["0"]
     result: dict[str, Any] = {
         "kind": outcome.kind,
         "poses": outcome.poses,
+        "delivered": {name: delivered[name] for name in ("mean", "max", "rms")},
+        "as_recorded": None if found.recorded is None else _statistics(found.recorded.tools),
         "tools": _statistics(outcome.tools),
         "nominal": None if outcome.nominal is None else _statistics(outcome.nominal),
         "p_value": outcome.p_value,

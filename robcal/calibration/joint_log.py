@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +25,7 @@ class JointLog:
     q : (n, joints) rad or m, as commanded.
     payload : (n,) name of the load, None without.
     verify : (n,) true for poses that are kept out of the identification.
-    approach : (n, joints) -1, 0, +1; approach_inferred : true where it was taken from the order of the poses.
+    approach : (n, joints) -1, 0, +1; inferred : joints (from 0) of which it was taken from the order of the poses.
     covariates : further numeric columns by name (``time_s``, ``temp_<place>_c``, any other).
     """
 
@@ -34,11 +34,22 @@ class JointLog:
     payload: tuple[str | None, ...] = field(repr=False)
     verify: NDArray[np.bool_] = field(repr=False)
     approach: Array = field(repr=False)
-    approach_inferred: bool = False
+    inferred: tuple[int, ...] = ()
     covariates: Mapping[str, Array] = field(default_factory=dict, repr=False)
 
     def __len__(self) -> int:
         return len(self.names)
+
+    @property
+    def approach_inferred(self) -> bool:
+        """Whether any approach direction was taken from the order of the poses."""
+        return bool(self.inferred)
+
+    def as_stated(self) -> JointLog:
+        """The log without what was inferred: approach 0 where no column states it, as for poses to predict."""
+        approach = self.approach.copy()
+        approach[:, list(self.inferred)] = 0.0
+        return replace(self, approach=approach, inferred=())
 
     def stated(self) -> dict[str, Array]:
         """All numeric columns (n,): covariates, approach directions, and each joint's last move (`moveK`, rad or m).

@@ -118,6 +118,19 @@ def well_measured(recording: RobotRecording, kept_out: Rows, names: Sequence[str
     return kept_out[~weak], [note]
 
 
+def evenly_weighted(frames: FrameObservations) -> FrameObservations:
+    """The frames that are not measured much worse than most, all with the same isotropic covariance.
+
+    Fitted to these, predictions agree with the measured places in their plain mean.
+    """
+    variance = np.trace(frames.covariance[:, :3, :3], axis1=1, axis2=2) / 3.0
+    turns = np.trace(frames.covariance[:, 3:, 3:], axis1=1, axis2=2) / 3.0
+    good = variance <= WEAK**2 * np.median(variance)
+    even = np.diag(np.repeat([np.mean(variance[good]), np.mean(turns[good])], 3))
+    count = int(good.sum())
+    return FrameObservations(frames.pose[good], frames.world_T_tool[good], np.tile(even, (count, 1, 1)))
+
+
 def rescaled(observations: Sequence[RobotObservations], variances: Sequence[Array]) -> tuple[RobotObservations, ...]:
     """Observations with other variances: a factor for each kind (for frames, one of position and one of rotation)."""
     out: list[RobotObservations] = []

@@ -11,7 +11,7 @@ import numpy as np
 from robcal.diagnosis.core.fitting import Fit, fit
 from robcal.diagnosis.core.recording import Recording
 from robcal.diagnosis.core.result import Diagnosis, Finding
-from robcal.diagnosis.findings import curve_findings, kept_out_error, named_findings, swap_findings
+from robcal.diagnosis.findings import at_last_fit, curve_findings, kept_out_error, named_findings, swap_findings
 from robcal.diagnosis.gain.heldout import noise_floor
 from robcal.diagnosis.gain.region import region_errors
 from robcal.diagnosis.next_poses import separating_poses
@@ -72,7 +72,10 @@ def diagnose(
     curves, of_curves = _curves(case)
     found = _searched(case, curves)
     final, whole, noise = _last_fit(case, curves, found)
-    findings = (*exchanged, *of_curves, *_named(case, found))
+    findings = (*of_curves, *_named(case, found))
+    if whole is not found.chosen.recording:
+        findings = tuple(at_last_fit(finding, final) for finding in findings)
+    findings = (*exchanged, *findings)
     before = fit(case.model, found.chosen.recording, case.free)
     heldout = (
         exchanged[0].heldout[0] if exchanged else kept_out_error(found.chosen.recording, before, case.verify),
@@ -165,8 +168,10 @@ def _last_fit(case: _Case, curves: Curves, found: _Found) -> tuple[Fit, Recordin
     chosen = found.chosen
     if case.thin is not case.recording or curves.accepted:
         # with all poses the scatter of the joints is known better than from those of the search
-        noise = estimate_noise(found.model, case.recording, found.free, chosen.accepted)
-        whole = noise.apply(case.recording)
+        blunders = [chosen.recording.names[row] for _, row in chosen.blunders]
+        kept = case.recording.subset(~np.isin(np.array(case.recording.names), blunders))
+        noise = estimate_noise(found.model, kept, found.free, chosen.accepted)
+        whole = noise.apply(kept)
         everything = (*curves.accepted, *chosen.accepted)
         return fit(replace(found.model, terms=case.model.terms), whole, chosen.free, everything), whole, noise
     if chosen.accepted or chosen.blunders:

@@ -126,6 +126,36 @@ def named_findings(
     return tuple(findings)
 
 
+def at_last_fit(finding: Finding, final: Fit) -> Finding:
+    """A finding with the amplitudes, sigmas and sentence of the last fit, to all poses and beside all other causes.
+
+    Weakness: the uncertainty of constants that were refined in the search is left out.
+    """
+    item = next((a for a in final.accepted if a.cause is finding.cause), None)
+    if item is None:
+        return finding
+    factor = final.variance_factor
+    values, spread = rescaled(final, item, item.covariance * factor, factor)
+    reported, sigma = numeric_sigma(finding.cause.report, values, item.constants, spread)
+    kept = {name: value for name, value in finding.parameters.items() if name not in reported}
+    for name, (parameter, unit) in finding.cause.jointly_fitted.items():
+        if parameter in final.free:
+            kept[name] = final.model.parameters[parameter] * unit
+    if "pose" in reported:
+        reported["pose"] = finding.parameters["pose"]
+    statement = finding.statement.replace(
+        finding.cause.describe(finding.parameters), finding.cause.describe(kept | reported)
+    )
+    return replace(
+        finding,
+        values=item.values,
+        covariance=item.covariance * factor,
+        parameters=kept | reported,
+        sigma={name: sigma.get(name, value) for name, value in finding.sigma.items()},
+        statement=statement,
+    )
+
+
 def _sum_of_squares(fitted: Fit) -> float:
     return float(fitted.residual @ fitted.residual)
 

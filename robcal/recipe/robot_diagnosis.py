@@ -8,15 +8,19 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from robcal.calibration.calibrated import CalibratedRobot, with_folded_cell
+from robcal.calibration.cell import with_fitted_cell
 from robcal.calibration.identifiability import weak_parameters
 from robcal.calibration.identification import IdentifiedRobot
 from robcal.calibration.joint_log import JointLog
-from robcal.calibration.measurements import RobotRecording, Rows
-from robcal.diagnosis.core.fitting import Accepted, Fit, fit
+from robcal.calibration.measurements import RobotRecording, Rows, evenly_weighted
+from robcal.calibration.observations import FrameObservations
+from robcal.diagnosis.core.fitting import Accepted, fit
 from robcal.diagnosis.core.recording import Recording
 from robcal.diagnosis.core.result import Diagnosis
 from robcal.diagnosis.diagnose import diagnose
 from robcal.diagnosis.images.diagnosis import ImageFinding
+from robcal.diagnosis.noise.components import estimate_noise
+from robcal.diagnosis.noise.swaps import find_swaps, relabelled
 from robcal.diagnosis.search.selection import SelectionSettings
 from robcal.photogrammetry.core.bodies import Body
 from robcal.photogrammetry.measure.measured_points import MeasuredPoints
@@ -27,6 +31,7 @@ from robcal.recipe.corrections import corrected
 from robcal.recipe.evidence import Evidence, evidence_of
 from robcal.recipe.identification import Identification
 from robcal.recipe.image_findings import ImageFindings
+from robcal.recipe.in_force import Form, InForce, choose
 from robcal.recipe.recording import recording_for_diagnosis
 from robcal.transforms import Array
 
@@ -55,14 +60,16 @@ class RobotDiagnosis:
     Attributes
     ----------
     recording : what was diagnosed.
+    in_force : whether the robot with what was found is delivered, and why.
     robot : the robot in force.
-    relative : (p, p) covariance of its parameters beside frames that are freed of the station's errors.
-    corrected : the measurements without what was found in the measuring system; None where nothing was.
+    relative : (p, p) covariance of its parameters against frames of the own station; None without one.
+    corrected : the measurements without the faults of the measuring system that the robot was fitted beside, if any.
     evidence : what every pose says of each cause.
     """
 
     diagnosis: Diagnosis
     recording: Recording = field(repr=False)
+    in_force: InForce
     robot: CalibratedRobot = field(repr=False)
     relative: Array | None = field(repr=False)
     corrected: RobotRecording | None = field(repr=False)
@@ -99,51 +106,71 @@ def diagnose_robot(
         tell,
         optional_parameters(robot),
     )
-    final = _final(diagnosis, recording)
-    shared = None if measured.station is None else final.common
-    calibrated, relative = replace_model(robot, diagnosis, shared is not None), None
-    of_station = None
-    if shared is not None:
-        # beside frames that are freed of the station's errors, the robot is as uncertain as if there were none
-        relative = _relative_covariance(diagnosis, recording) * final.variance_factor
-        whole = measured.recording(log, found.recording, found.recording.poses)
-        of_station = None if whole is None or whole.common is None else whole.common @ shared
+    swapped = any(f.cause.kind.is_relabelling for f in diagnosis.findings)
+    clean = relabelled(recording, find_swaps(recording)) if swapped else recording
+    kept = ~np.isin(np.array(clean.names), diagnosis.blunders)
+    clean, rows = clean.subset(kept), found.rows[kept]
+    bare, extended = Form(robot.model, free), Form(diagnosis.model, diagnosis.free, _displacements(diagnosis))
+    in_force = InForce(bare, False, float("nan"), float("nan"), "nothing was found")
+    if diagnosis.findings:
+        in_force = choose(clean, log, rows, bare, extended)
+    if not in_force.diagnosed:
+        used = robot.used[kept]  # poses that the identification left out
+        clean, rows = clean.subset(used), rows[used]
+    delivered, relative = robot_in_force(found, log, clean, rows, in_force.form)
     return RobotDiagnosis(
         diagnosis=diagnosis,
         recording=recording,
-        robot=calibrated,
+        in_force=in_force,
+        robot=delivered,
         relative=relative,
-        corrected=corrected(found.recording, log, diagnosis, of_station),
+        corrected=corrected(found.recording, log, diagnosis) if in_force.form.direct else None,
         evidence=evidence_of(robot.model, recording, free, verify, diagnosis),
     )
 
 
-def replace_model(found: IdentifiedRobot, diagnosis: Diagnosis, beside_station: bool) -> CalibratedRobot:
-    """The robot in force after a diagnosis.
+def robot_in_force(
+    found: Identification, log: JointLog, recording: Recording, rows: Rows, form: Form
+) -> tuple[CalibratedRobot, Array | None]:
+    """All parameters and terms of a model once more together, with base and tool in the datum of the measurements.
 
-    A robot that was fitted beside the errors of its station is better even where nothing is missing.
+    A robot that is fitted beside the errors of its own station is better than one from its frames alone; what those
+    errors displace all frames by is no part of the robot, so base and tool follow from the frames as they were measured
+    and as a table of poses states them.
+
+    Parameters
+    ----------
+    recording, rows : the poses to fit to, and their rows in the joint log.
+
+    Returns
+    -------
+    The robot, and (p, p) the covariance of its parameters where errors common to all poses are known, None where there
+    are none.
     """
+    noise = estimate_noise(form.model, recording, form.free, form.direct)
+    final = form.fit(noise.apply(recording))
+    p, relative = len(final.free), None
+    if recording.own_station and final.common is not None:
+        known = fit(final.model, replace(noise.apply(recording), common=None), form.free, form.direct, iterations=0)
+        relative = known.covariance[:p, :p] * final.variance_factor
     robot = CalibratedRobot(
-        model=found.model,
-        names=found.names,
-        covariance=found.covariance,
-        covariance_scale=found.covariance_scale,
-        joint_sigma=diagnosis.joint_sigma,
-        statics=found.statics,
-        nominal=found.nominal,
-        q=found.q,
-        tools=found.tools,
-        defaults=found.defaults,
-    )
-    if not (diagnosis.findings or beside_station):
-        return robot
-    return replace(
-        robot,
-        model=with_folded_cell(diagnosis.model),
-        names=diagnosis.free,
-        covariance=diagnosis.covariance,
+        model=with_folded_cell(final.model),
+        names=final.free,
+        covariance=final.covariance[:p, :p] * final.variance_factor,
+        covariance_scale=noise.factor,
+        joint_sigma=noise.joint_sigma,
         statics="converged",  # as the diagnosis fits
     )
+    if recording.observations_are_spatial:
+        joint = noise.joint_sigma / np.sqrt(noise.factor)
+        stated = log.as_stated().inputs(robot.kernel).subset(rows)
+        measured = found.recording.select(rows)
+        if recording.own_station:
+            joint = 0.0
+            measured = tuple(evenly_weighted(o) if isinstance(o, FrameObservations) else o for o in measured)
+        robot = replace(robot, model=with_fitted_cell(robot.kernel, stated, measured, joint))
+    nominal = found.robot.nominal
+    return (robot if nominal is None else robot.with_recording(log, nominal)), relative
 
 
 def own_elasticities(found: IdentifiedRobot) -> tuple[str, ...]:
@@ -183,18 +210,10 @@ def settings_beside(settings: SelectionSettings, findings: Sequence[ImageFinding
     return settings
 
 
-def _relative_covariance(diagnosis: Diagnosis, recording: Recording) -> Array:
-    """Covariance (p, p) of the free parameters where errors common to all poses are known, variance factor one."""
-    known = _final(diagnosis, replace(recording, common=None), iterations=0)
-    return known.covariance[: len(diagnosis.free), : len(diagnosis.free)]
-
-
-def _final(diagnosis: Diagnosis, recording: Recording, iterations: int = 8) -> Fit:
-    """The extended model at the recording: its terms are in the model, observation causes beside it."""
-    direct = [
+def _displacements(diagnosis: Diagnosis) -> tuple[Accepted, ...]:
+    """Causes that displace what is measured: they stand beside the model, all others are in it."""
+    return tuple(
         Accepted(f.cause, f.constants, f.values, f.covariance)
         for f in diagnosis.findings
-        if isinstance(f.cause, ObservationCause)
-    ]
-    clean = recording.subset(~np.isin(np.array(recording.names), diagnosis.blunders))
-    return fit(diagnosis.model, clean, diagnosis.free, direct, iterations=iterations)
+        if isinstance(f.cause, ObservationCause) and not f.cause.kind.is_relabelling
+    )

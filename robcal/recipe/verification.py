@@ -3,24 +3,47 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from robcal.calibration.calibrated import CalibratedRobot
+from robcal.calibration.cell import with_fitted_cell
 from robcal.calibration.identification import IdentifiedRobot, IdentifyOptions
 from robcal.calibration.joint_log import JointLog
 from robcal.calibration.measurements import RobotRecording, Rows, well_measured
+from robcal.calibration.observations import FrameObservations
 from robcal.calibration.verification import Verification, cross_validate, fit_nominal, repetitions, tool_errors, verify
+from robcal.errors import InvalidInput
 from robcal.recipe.identification import Identification
 from robcal.robot.kernel import PoseInputs
 from robcal.robot.model import RobotModel
-from robcal.transforms import Array
+from robcal.transforms import Array, difference
 
 FOLDS = 5
 BLUNDER, LEAST_BLUNDER = 5.0, 0.02
 """A kept-out pose is no measurement of this robot if the nominal one misses it by this factor more than any other pose,
 and by this much (m) more."""
+SIGMAS = 4.0
+"""Standard errors by which the mean of the residuals may differ from zero."""
+
+
+@dataclass(frozen=True)
+class RobotVerification:
+    """The robot in force where it was not identified.
+
+    Attributes
+    ----------
+    delivered : against the measurements as they are, predicted from what the table of poses states, as for any user.
+    recorded : with what only the recording knows (approach directions inferred, measurements freed of what was found in
+        the measuring system), None where there is nothing of that.
+    rows : (n,) rows of the poses in the joint log. notes : what was left out or assumed.
+    """
+
+    delivered: Verification
+    recorded: Verification | None
+    rows: Rows = field(repr=False)
+    notes: tuple[str, ...] = ()
 
 
 def verify_robot(
@@ -31,43 +54,85 @@ def verify_robot(
     options: IdentifyOptions,
     freed: RobotRecording | None = None,
     relative: Array | None = None,
-) -> tuple[Verification, Rows, list[str]]:
+) -> RobotVerification:
     """Verify on the kept-out poses, or by folds where there are none.
 
     Parameters
     ----------
     model : the nominal robot. robot : the one in force.
-    freed : the measurements without what the diagnosis found in the measuring system; relative : covariance (p, p) of
-        the robot's parameters beside them.
-
-    Returns
-    -------
-    The verification, the rows (n,) of its poses in the joint log, and sentences on what was left out or assumed.
+    freed : the measurements without what the diagnosis found in the measuring system.
+    relative : covariance (p, p) of the robot's parameters against frames of the own station.
     """
+    rows, recording = identification.sound, identification.recording
+    stated, inputs = robot.inputs(log.as_stated()), log.inputs(robot.kernel)
+    kept_out, notes = well_measured(recording, identification.kept_out(log), log.names)
+    if not len(kept_out):
+        groups = repetitions(log.q[rows])
+        folds = min(FOLDS, int(groups.max()) + 1)
+        with_terms = model.with_terms(robot.model.terms)
+        outcome = cross_validate(
+            with_terms, inputs.subset(rows), recording.select(rows), options, folds=folds, groups=groups
+        )
+        notes = [*notes, f"no verification poses: {folds}-fold cross-validation over groups of poses"]
+        return RobotVerification(outcome, None, rows, tuple(notes))
+    tested = robot if relative is None else replace(robot, covariance=relative)
+    foreign = _foreign(recording, rows, kept_out)
+    if foreign:
+        # another measuring system has a world and a tool of its own, and nobody but these poses knows them
+        placed = with_fitted_cell(robot.kernel, stated.subset(kept_out), recording.select(kept_out), anew=True)
+        tested = replace(tested, model=placed)
+        notes = [*notes, f"{foreign} serve the verification alone: their world and tool are fitted to these very poses"]
+        nominal = fit_nominal(model, stated.subset(kept_out), recording.select(kept_out))
+    else:
+        nominal = fit_nominal(model, stated.subset(rows), recording.select(rows))
+        kept_out, said = without_blunders(nominal, stated, recording, rows, kept_out, log.names)
+        notes = [*notes, *said]
+    outcome = verify(tested, stated.subset(kept_out), recording.select(kept_out), nominal)
+    if relative is not None:
+        # in the world, the robot is as uncertain as the station as well
+        _, C = robot.predict(stated.subset(kept_out))
+        outcome = replace(outcome, predicted=np.sqrt(np.trace(C[:, :3, :3], axis1=1, axis2=2) / 3.0))
+    recorded = None
+    if not foreign and (freed is not None or log.inferred):
+        used = recording if freed is None else freed
+        placed = with_fitted_cell(robot.kernel, inputs.subset(rows), used.select(rows))
+        beside = replace(tested, model=placed)
+        recorded = verify(beside, inputs.subset(kept_out), used.select(kept_out))
+        if freed is not None:
+            # the stated uncertainty is that of the robot; faults of the measuring are told apart
+            judged = {name: getattr(recorded, name) for name in ("normalised", "degrees", "p_value", "coverage_95")}
+            outcome = replace(outcome, **judged)
+            notes = [*notes, "uncertainties are judged without the faults of the measuring system that were found"]
+    return RobotVerification(outcome, recorded, kept_out, tuple(notes))
+
+
+def _foreign(recording: RobotRecording, rows: Rows, kept_out: Rows) -> str:
+    """Kinds of measurement that only poses to verify with have, in words; empty if there are none."""
+    known = {type(o) for o in recording.select(rows)}
+    kinds = [type(o).__name__.removesuffix("Observations").lower() + "s" for o in recording.select(kept_out)]
+    foreign = [k for o, k in zip(recording.select(kept_out), kinds, strict=True) if type(o) not in known]
+    if foreign and len(foreign) < len(kinds):
+        raise InvalidInput(
+            f"{' and '.join(foreign)} are measured at poses to verify with only, {kinds[0]} at others: list them as "
+            "instruments of their own"
+        )
+    return " and ".join(foreign)
+
+
+def datum_note(identification: Identification, robot: CalibratedRobot, log: JointLog) -> str:
+    """Where measured frames and predictions at the identified poses do not agree in the mean; empty if they do."""
     rows = identification.sound
-    recording = identification.recording if freed is None else freed
-    notes = [] if freed is None else ["verified without the errors of the measuring system that all poses share"]
-    inputs = log.inputs(robot.kernel)
-    kept_out, said = well_measured(recording, identification.kept_out(log), log.names)
-    notes += said
-    if len(kept_out):
-        nominal = fit_nominal(model, inputs.subset(rows), recording.select(rows))
-        kept_out, said = without_blunders(nominal, inputs, recording, rows, kept_out, log.names)
-        notes += said
-        tested = robot if relative is None else replace(robot, covariance=relative)
-        outcome = verify(tested, inputs.subset(kept_out), recording.select(kept_out), nominal)
-        if relative is not None:
-            # in the world, the robot is as uncertain as the station as well
-            _, C = robot.predict(inputs.subset(kept_out))
-            outcome = replace(outcome, predicted=np.sqrt(np.trace(C[:, :3, :3], axis1=1, axis2=2) / 3.0))
-        return outcome, kept_out, notes
-    groups = repetitions(log.q[rows])
-    folds = min(FOLDS, int(groups.max()) + 1)
-    with_terms = model.with_terms(robot.model.terms)
-    outcome = cross_validate(
-        with_terms, inputs.subset(rows), recording.select(rows), options, folds=folds, groups=groups
-    )
-    return outcome, rows, [*notes, f"no verification poses: {folds}-fold cross-validation over groups of poses"]
+    T = robot.predict(robot.inputs(log.as_stated()).subset(rows))[0]
+    for o in identification.recording.select(rows):
+        if not isinstance(o, FrameObservations) or len(o.pose) < 3:
+            continue
+        off = difference(T[o.pose], o.world_T_tool)[:, :3]
+        off = np.einsum("nij,nj->ni", T[o.pose, :3, :3], off)
+        mean, sigma = off.mean(axis=0), off.std(axis=0, ddof=1) / np.sqrt(len(off))
+        if np.any(np.abs(mean) > SIGMAS * sigma + 1e-9):
+            told = ", ".join(f"{1e3 * m:+.3g} +- {1e3 * s:.2g}" for m, s in zip(mean, sigma, strict=True))
+            return f"predictions differ from the measured frames by {told} mm in the mean (x, y, z)"
+    return ""
 
 
 def without_blunders(

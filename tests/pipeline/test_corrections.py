@@ -14,7 +14,8 @@ def test_scale_error_is_taken_back_before_the_verification(tmp_path: Path) -> No
     assert [c["cause"] for c in done.result["diagnosis"]["causes"]] == ["scale_error"]
     verification = done.result["verification"]
     # noise of the measured frames is about 0.05 mm, the scale displaces the tool by half a millimetre
-    assert verification["tools"]["0"]["mean"] < 0.1
+    assert verification["as_recorded"]["0"]["mean"] < 0.1
+    assert verification["delivered"]["mean"] == verification["tools"]["0"]["mean"]
     assert verification["coverage_95"] > 0.7
     assert json.loads((tmp_path / "run" / "result.json").read_text())["verification"] == verification
 

@@ -1,0 +1,124 @@
+"""What a robot delivers at poses that it was not fitted to: predicted from what a table of poses states, no more.
+
+Approach directions that were inferred and displacements of the measurement are left out, base and tool are those of the
+measurements as they are. Errors come from blocked folds (Roberts et al., 2017): poses that follow one another stay
+together, and so do repeats.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from robcal.calibration.identifiability import repetitions
+from robcal.diagnosis.core.fitting import Fit, solve
+from robcal.diagnosis.core.recording import Recording
+from robcal.diagnosis.gain.heldout import folds
+from robcal.physics.cause import Array, ObservationCause
+from robcal.robot.kernel import PoseInputs
+from robcal.robot.model import GEOMETRIC_KINDS
+
+MUCH_WORSE = 1.25
+"""Factor by which the error in one fold may grow."""
+CLEAR, CLEAR_SIGMAS = 0.9, 3.0
+"""Factor to which the error has to fall, and standard errors, for a fault of the measuring to be beyond doubt."""
+WEIGHTED_SIGMAS = 2.0
+"""Standard errors by which the weighted error has to fall where the plain one does not."""
+WAITING = 1.01
+"""Factor by which the error may grow where terms wait for approach directions that the user may state."""
+
+
+def blocked_folds(recording: Recording) -> Array:
+    """Fold of each pose (n,): blocks of consecutive poses; repeats of a pose are in the fold of the first of them."""
+    labels = folds(recording)
+    groups = repetitions(recording.q)
+    first = np.unique(groups, return_index=True)[1]
+    return np.asarray(labels[first[groups]])
+
+
+def delivered_errors(
+    recording: Recording, fitted: Fit, inputs: PoseInputs, labels: Array, *, freed: bool = False
+) -> tuple[Array, Array]:
+    """Lengths (m_obs,) of the position errors, m, and of the whitened ones, of observations predicted from other folds.
+
+    Parameters
+    ----------
+    recording : as it was measured. fitted : a fit to it, errors common to all poses not taken off.
+    inputs : the poses as they would be stated to predict. labels : fold of each pose (n,).
+    freed : whether the measurements count without the displacements that the fit holds for faults of the measuring.
+    """
+    kernel = fitted.kernel
+    columns = np.array([kernel.index[name] for name in fitted.free], dtype=np.intp)
+    frames, J = kernel.frames_and_jacobian(fitted.theta, inputs, columns)
+    plain = replace(recording, common=None, shared=None)
+    residual, jacobian = plain.linearise(frames, J)
+    cell = [f"{end}.{kind}" for end in ("base", "tool") for kind in GEOMETRIC_KINDS]
+    own = [k for k, name in enumerate(fitted.free) if name in cell]
+    displaced = fitted.jacobian[:, len(columns) :]
+    direct = [item.values for item in fitted.accepted if isinstance(item.cause, ObservationCause)]
+    amplitudes = np.concatenate(direct) if direct else np.zeros(0)
+    fold_of_row = labels[fitted.row_pose]
+    left = np.empty(len(residual))
+    for fold in np.unique(labels):
+        test = fold_of_row == fold
+        rows = np.vstack([fitted.jacobian[~test], fitted.prior])
+        step = solve(rows, np.concatenate([fitted.residual[~test], fitted.prior_residual]))
+        after = residual - jacobian @ step[: len(columns)]
+        if freed:
+            after = after - displaced @ (amplitudes + step[len(columns) :])
+        # base and tool are those of the measurements as they are
+        left[test] = after[test] - jacobian[np.ix_(test, own)] @ solve(jacobian[np.ix_(~test, own)], after[~test])
+    errors = plain.unwhiten(left[:, None], frames)[:, :3, 0]
+    count = len(recording.observations.pose)
+    return np.linalg.norm(errors, axis=1), np.linalg.norm(left.reshape(count, -1), axis=1)
+
+
+@dataclass(frozen=True)
+class Gain:
+    """What a change of the robot gains: errors before and after (RMS), standard error, errors of the folds."""
+
+    before: float
+    after: float
+    sigma: float
+    folds_before: Array
+    folds_after: Array
+
+    @property
+    def pays(self) -> bool:
+        """The error falls by more than its own standard error, and in no fold it grows much."""
+        return self.before - self.after > self.sigma and self.even
+
+    def pays_beside(self, weighted: Gain) -> bool:
+        """The error falls, or that weighted by its uncertainty does beyond doubt while this one stays as it is.
+
+        Directions and places that are measured best show small effects which the plain length hides in noise.
+        """
+        falls = weighted.before - weighted.after > WEIGHTED_SIGMAS * weighted.sigma and weighted.even
+        return self.pays or (falls and self.even and self.after <= WAITING * self.before)
+
+    @property
+    def clear(self) -> bool:
+        """The error falls much, far beyond its standard error, and in every fold."""
+        falls = self.after <= CLEAR * self.before and self.before - self.after > CLEAR_SIGMAS * self.sigma
+        return falls and bool(np.all(self.folds_after <= self.folds_before))
+
+    @property
+    def even(self) -> bool:
+        """In no fold the error grows much."""
+        return bool(np.all(self.folds_after <= MUCH_WORSE * self.folds_before))
+
+
+def gain_of(before: Array, after: Array, fold: Array) -> Gain:
+    """Gain from errors (m_obs,) of the same observations; its standard error is that of the jackknife over folds."""
+
+    def rms(errors: Array, keep: Array) -> float:
+        return float(np.sqrt(np.mean(errors[keep] ** 2)))
+
+    labels = np.unique(fold)
+    without = np.array([rms(before, fold != k) - rms(after, fold != k) for k in labels])
+    n = len(labels)
+    sigma = float(np.sqrt((n - 1) / n * np.sum((without - without.mean()) ** 2)))
+    inside = [np.array([rms(errors, fold == k) for k in labels]) for errors in (before, after)]
+    whole = np.ones(len(fold), dtype=bool)
+    return Gain(rms(before, whole), rms(after, whole), sigma, inside[0], inside[1])
