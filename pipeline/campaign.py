@@ -14,7 +14,14 @@ from robcal.files.body_file import BodyFile, check_ring_codes, read_body
 from robcal.files.camera_file import CameraFile, read_camera
 from robcal.files.camera_import import split_choice
 from robcal.files.images import list_images
-from robcal.files.measurement_tables import MarksTable, MeasuredTable, read_marks, read_measurements, without_frozen
+from robcal.files.measurement_tables import (
+    MarksTable,
+    MeasuredTable,
+    check_marks,
+    read_marks,
+    read_measurements,
+    without_frozen,
+)
 from robcal.files.poses_table import Poses, read_poses
 from robcal.files.robot_import import read_any_robot
 from robcal.files.schemas import parse, proposal
@@ -258,7 +265,9 @@ class _Reader:
         if start is not None:
             size = (start.camera.width, start.camera.height)
         if entry.observations is not None:
-            return ImageSource({}, read_marks(self._file(entry.observations)), start, start_path, size)
+            marks = read_marks(self._file(entry.observations))
+            check_marks(marks, size)
+            return ImageSource({}, marks, start, start_path, size)
         folder = self._place(str(entry.images)).absolute()  # the report looks for them from anywhere
         return ImageSource(list_images(folder, what), None, start, start_path, size)
 

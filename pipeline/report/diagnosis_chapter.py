@@ -67,7 +67,7 @@ def _how_sure(d: Mapping[str, Any]) -> str:
     else:
         text = (
             "Every candidate of the library at every place was tried; the strongest of them is as strong as chance "
-            f"alone makes it with probability {number(p, 2)}. Nothing was added to the model."
+            f"alone makes it with probability {probability(p)}. Nothing was added to the model."
         )
     noise = d.get("noise") or {}
     factor = noise.get("estimated")
@@ -81,9 +81,9 @@ def _how_sure(d: Mapping[str, Any]) -> str:
     if left is not None and d.get("mismatch"):
         pattern = (d.get("unexplained") or {}).get("pattern")
         text += (
-            f" After that nothing significant is left (p = {number(left, 2)})."
+            f" After that nothing significant is left (p = {probability(left)})."
             if left > LEVEL
-            else f" Something stays unexplained (p = {number(left, 2)}{', ' + str(pattern) if pattern else ''})."
+            else f" Something stays unexplained (p = {probability(left)}{', ' + str(pattern) if pattern else ''})."
         )
     if d.get("blunders"):
         text += f" {len(d['blunders'])} observations are gross errors and took no part."

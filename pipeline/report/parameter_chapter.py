@@ -9,7 +9,7 @@ import numpy as np
 
 from pipeline.report.blocks import Block, Chapter, Table, Text, table
 from pipeline.report.material import Material
-from pipeline.report.style import number, to_sigma
+from pipeline.report.style import number, probability, to_sigma
 from robcal.calibration.identification import IdentifiedRobot
 from robcal.robot.kernel import Kernel
 from robcal.robot.model import RobotModel, parameter_unit
@@ -124,7 +124,7 @@ def _gauges(found: IdentifiedRobot, diagnosed: bool) -> list[Block]:
         f"{len(found.names)} parameters from {int(found.used.sum())} poses, {found.iterations} iterations in "
         f"{found.seconds:.2f} s. Condition of the scaled normal equations {number(found.condition)} (of the raw "
         f"ones {number(found.condition_raw)}), redundancy {found.redundancy}, sigma0 {number(found.sigma0)} "
-        f"(one where residuals agree with the stated covariance; p = {number(found.p_value, 2)})."
+        f"(one where residuals agree with the stated covariance; p = {probability(found.p_value)})."
     )
     blocks.append(Text(f"Before the diagnosis added its terms: {sentence}" if diagnosed else sentence))
     if rows:

@@ -11,7 +11,7 @@ from pipeline.artifacts import CORRECTED
 from pipeline.report.blocks import Grade, KeyFigure, Verdict
 from pipeline.report.diagnosis_chapter import short_statement
 from pipeline.report.material import Material
-from pipeline.report.style import number, percent
+from pipeline.report.style import number, percent, probability
 from pipeline.report.verification_chapter import error_table, noise_by_tool
 from robcal.calibration.observations import FrameObservations
 from robcal.calibration.verification import Verification
@@ -19,8 +19,6 @@ from robcal.physics.library import kinds
 
 LEVEL = 0.01
 """Probability below which errors are called larger than predicted, or a rest unexplained."""
-MODEST = 1.2
-"""A robot whose errors shrink by less than this factor is not worth loading."""
 
 
 def verdict_of(material: Material) -> Verdict:
@@ -50,7 +48,7 @@ def told_diagnosis(material: Material) -> str:
     left = d.get("unexplained") or {}
     p = left.get("p_value")
     if p is not None and p < LEVEL:
-        text += f" Something stays unexplained (p = {number(p, 2)}" + (
+        text += f" Something stays unexplained (p = {probability(p)}" + (
             f", {left['pattern']})." if left.get("pattern") else ")."
         )
     return text
@@ -65,23 +63,10 @@ def _robot(material: Material, v: Verification) -> Verdict:
     noise = noise_by_tool(material)
     after, before = v.tools["0"], v.nominal["0"] if v.nominal else None
     gain = before.mean / after.mean if before is not None and after.mean > 0 else float("nan")
-    unexplained = ((material.diagnosis or {}).get("unexplained") or {}).get("p_value")
-    strange = not_named(material.diagnosis)
-    grade: Grade = "good"
-    doubts = []
-    if v.p_value < LEVEL and v.coverage_95 < 0.9:
-        grade = "care"
-        doubts.append("the errors are larger than their predicted uncertainty")
-    if unexplained is not None and unexplained < LEVEL:
-        grade = "care"
-        doubts.append("the diagnosis finds structure that it cannot explain")
-    if strange:
-        grade = "care"
-        doubts.append("part of the correction is an empirical term without a physical name")
-    if np.isfinite(gain) and gain < MODEST:
-        grade = "bad"
-        doubts = ["calibration does not make this robot better"]
-    word = {"good": "Good", "care": "Usable, with care", "bad": "Not better"}.get(grade, "")
+    told = material.result.get("verdict", {})
+    grade: Grade = told.get("grade", "none")
+    doubts = list(told.get("reasons", []))
+    word = str(told.get("text", "No verdict")).split(":")[0].rstrip(".")
     change = (
         f"The robot's mean error falls from {number(before.mean * 1e3)} to {number(after.mean * 1e3)} mm "
         f"({gain:.{1 if gain < 10 else 0}f} times better), the largest from {number(before.max * 1e3)} to "
@@ -89,9 +74,7 @@ def _robot(material: Material, v: Verification) -> Verdict:
         if before is not None
         else f"The robot's mean error is {number(after.mean * 1e3)} mm, the largest {number(after.max * 1e3)} mm"
     )
-    but = f", but {' and '.join(doubts)}" if doubts else ""
-    if grade == "bad":
-        but = ": " + doubts[0]
+    but = f", but {'; '.join(doubts)}" if doubts else ""
     kept = (
         f"Tested on {v.poses} poses kept out of the identification and of every choice"
         if v.kind == "verify-set"

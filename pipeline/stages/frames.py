@@ -12,14 +12,14 @@ from pipeline.campaign import Campaign
 from pipeline.runs import Run
 from pipeline.stages.base import Context, Outcome, Stage
 from robcal.errors import InvalidInput
-from robcal.files.frame_tables import frame_columns, frame_covariance_columns, twist_from_six
+from robcal.files.frame_tables import frame_columns, frame_covariance_columns, six_covariance
 from robcal.files.poses_table import Poses
 from robcal.files.tables import write_table
 from robcal.photogrammetry.core.bodies import Body, line_ratio
 from robcal.photogrammetry.measure.frames import MeasuredFrames, measure_frames
 from robcal.photogrammetry.measure.measured_points import MeasuredPoints
 from robcal.photogrammetry.measure.point_faults import length_ratio, mirrored, unit_fault
-from robcal.transforms import Array, xyzrpy_from_frame
+from robcal.transforms import Array
 
 NAME = "frames"
 STRAIGHT = 0.02
@@ -90,10 +90,8 @@ def _body(campaign: Campaign, run: Run) -> Body | None:
 def write_frames(run: Run, poses: Poses, frames: MeasuredFrames) -> None:
     """frames.csv of the run, with the full covariance of the six numbers."""
     T = frames.world_T_body
-    six = xyzrpy_from_frame(T)
-    jacobian = np.linalg.inv(twist_from_six(six))
     scale = np.array([1000.0] * 3 + [180 / np.pi] * 3)
-    numbers = jacobian @ frames.covariance @ np.swapaxes(jacobian, 1, 2) * np.outer(scale, scale)
+    numbers = six_covariance(T, frames.covariance) * np.outer(scale, scale)
     columns: dict[str, Any] = {"pose": [poses.names[i] for i in frames.pose], **frame_columns(T)}
     for name, i, j in frame_covariance_columns():
         columns[name] = [f"{v:.9g}" for v in numbers[:, i, j]]

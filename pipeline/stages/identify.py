@@ -15,11 +15,13 @@ from pipeline.stages.observations import build_recording
 from pipeline.stages.survey import located
 from robcal.calibration.calibrated import CalibratedRobot
 from robcal.calibration.identification import IdentifiedRobot, IdentifyOptions
-from robcal.calibration.measurements import Rows
+from robcal.calibration.measurements import RobotRecording, Rows
 from robcal.calibration.recording_faults import fault_of
+from robcal.calibration.slips import mirror_misses
 from robcal.errors import InvalidInput, RobcalError
 from robcal.files.poses_table import Poses
 from robcal.files.robot_file import write_robot
+from robcal.photogrammetry.survey.given_coordinates import GivenCoordinates
 from robcal.recipe.identification import identify_robot
 from robcal.robot.kernel import Kernel
 from robcal.robot.model import RobotModel
@@ -49,6 +51,7 @@ def work(context: Context) -> Outcome:
     campaign, run = context.campaign, context.run
     robot, poses = require_robot(campaign)
     recording = build_recording(campaign, run, body_for_robot(campaign, run))
+    _check_mirror_image(campaign, run, recording)
     try:
         found = identify_robot(robot, poses, recording, options_of(campaign, recording.stated))
     except InvalidInput as error:
@@ -57,6 +60,34 @@ def work(context: Context) -> Outcome:
     write_robot(run.robot, found.robot.model, f"calibrated from campaign {campaign.name}, before the diagnosis")
     notes = [*found.recording.notes, *_notes(found.robot, poses, found.rows)]
     return Outcome({"identification": _result(found.robot, found.rows)}, outputs, notes)
+
+
+def _check_mirror_image(campaign: Campaign, run: Run, recording: RobotRecording) -> None:
+    """Where survey and given coordinates are mirror images of each other, the robot tells which of them is right.
+
+    Raises
+    ------
+    InvalidInput : they are.
+    """
+    record, name = run.record("survey"), campaign.carried_body
+    entry = dict(record.result).get("survey", {}).get(name, {}) if record is not None else {}
+    if not entry.get("mirrored_mm") or name is None:
+        return
+    robot, poses = require_robot(campaign)
+    words = GivenCoordinates(mirrored=tuple(1e-3 * value for value in entry["mirrored_mm"])).mirror_words
+    straight, mirrored = mirror_misses(robot, poses.inputs(Kernel(robot)), recording.observations)
+    proof = f"the robot misses the frames by {1e3 * straight:.3g} mm, their mirror images by {1e3 * mirrored:.3g} mm"
+    survey = campaign.bodies[name].survey
+    marks = survey.marks.path if survey is not None and survey.marks is not None else campaign.path
+    if mirrored < straight:
+        raise InvalidInput(
+            f"{marks}: the image axes are mirrored: {words}, and {proof}: count x_px to the right and y_px downwards "
+            "from the centre of the top left pixel"
+        )
+    raise InvalidInput(
+        f"{campaign.bodies[name].file.path}: the given coordinates are mirrored: {words}, while {proof}: a column of "
+        "xyz_mm has the wrong sign, or two are exchanged"
+    )
 
 
 def check_joint_limits(campaign: Campaign, run: Run) -> None:

@@ -22,6 +22,7 @@ from robcal.photogrammetry.bundle.colmap_engine import export_colmap
 from robcal.photogrammetry.core.bodies import Body
 from robcal.photogrammetry.core.camera import INTRINSIC_NAMES
 from robcal.photogrammetry.core.network import Lengths
+from robcal.photogrammetry.survey.given_coordinates import GivenCoordinates, compare_given
 from robcal.photogrammetry.survey.survey import BodyTarget, SurveyImage, SurveyResult, survey_body
 
 NAME = "survey"
@@ -39,7 +40,9 @@ def work(context: Context) -> Outcome:
         outputs += [run.save(artifacts.survey(name), done), run.save(artifacts.surveyed_body(name), body)]
         outputs += _write(run, name, source.survey, body, done)
         notes += [f"survey of '{name}': {note}" for note in _notes(done)]
-        results[name] = _result(done)
+        doubts = _against_given(campaign, source, done)
+        notes += doubts.told(name)
+        results[name] = _result(done) | {"contradictions": doubts.told(name), "mirrored_mm": doubts.mirrored_mm}
     return Outcome({"survey": results}, outputs, notes)
 
 
@@ -77,6 +80,27 @@ def survey_one(campaign: Campaign, run: Run, name: str, source: BodySource) -> S
         )
     except RobcalError as error:
         raise located(error, f"{campaign.path}: survey of body '{name}'") from None
+
+
+def _against_given(campaign: Campaign, source: BodySource, done: SurveyResult) -> GivenCoordinates:
+    """The given coordinates beside the surveyed ones.
+
+    Raises
+    ------
+    InvalidInput : they are mirror images, and no robot is there to tell which of them is right.
+    """
+    listed = {t.id: t for t in source.file.targets if t.id is not None and t.xyz is not None}
+    ids = done.network.ids
+    given = np.array([listed[int(i)].xyz if int(i) in listed else (np.nan,) * 3 for i in ids], dtype=float)
+    stated = [listed[int(i)].sigma if int(i) in listed else None for i in ids]
+    sigma = np.array([np.nan if s is None else max(s) for s in stated])
+    found = compare_given(ids, done.network.points, given.reshape(-1, 3), sigma)
+    if found.mirrored is not None and (campaign.robot is None or campaign.entry.station is None):
+        raise InvalidInput(
+            f"{source.file.path}: {found.mirror_words}: either the image axes are mirrored (y counted upwards, or x to "
+            "the left) or these coordinates are (a column with the wrong sign, a left-handed system): correct one"
+        )
+    return found
 
 
 def located(error: RobcalError, where: str) -> RobcalError:

@@ -9,23 +9,28 @@ import numpy as np
 
 from pipeline import artifacts
 from pipeline.codec import save_arrays
+from pipeline.json_io import read_json
 from pipeline.runs import Run
 from pipeline.stages.base import Context, Outcome, Stage, no_files
 from pipeline.stages.identify import load_calibrated, options_of, require_robot
 from pipeline.stages.survey import located
 from robcal.calibration.calibrated import CalibratedRobot
 from robcal.calibration.measurements import RobotObservations
+from robcal.calibration.noise_parts import NoiseParts
 from robcal.calibration.observations import (
     DistanceObservations,
     FrameObservations,
     PointObservations,
     SensorPointObservations,
 )
+from robcal.calibration.verdict import verdict
 from robcal.calibration.verification import ErrorStatistics
 from robcal.errors import InvalidInput
 from robcal.files.poses_table import Poses
 from robcal.files.robot_file import write_robot
 from robcal.files.tables import write_table
+from robcal.recipe.noise import noise_of
+from robcal.recipe.verdict import robot_facts
 from robcal.recipe.verification import RobotVerification, datum_note, verify_robot
 from robcal.robot.model import parameter_unit
 
@@ -59,7 +64,14 @@ def work(context: Context) -> Outcome:
         run.residuals,
     ]
     notes = [*found.notes, *_approach_note(found), *filter(None, [datum_note(identification, calibrated, poses)])]
-    return Outcome({"verification": _result(found)}, outputs, notes)
+    diagnosis = read_json(run.diagnosis) if diagnosed and run.diagnosis.is_file() else None
+    judged = verdict(
+        robot_facts(identification, calibrated, poses, found.delivered, diagnosis, doubtful_coordinates(run))
+    )
+    told = {"grade": judged.grade, "text": judged.text, "reasons": list(judged.reasons)}
+    noise = noise_of(identification, calibrated, poses)
+    result = {"verification": _result(found), "noise": _noise_result(noise), "verdict": told}
+    return Outcome(result, outputs, [*notes, *noise.notes])
 
 
 def _approach_note(found: RobotVerification) -> list[str]:
@@ -70,6 +82,25 @@ def _approach_note(found: RobotVerification) -> list[str]:
     if after > PAYS * before:
         return []
     return [f"state approach: {before:.3f} -> {after:.3f} mm RMS at the kept-out poses"]
+
+
+def _noise_result(noise: NoiseParts) -> dict[str, Any]:
+    return {
+        "measurement_mm": 1e3 * noise.measurement,
+        "source": noise.source,
+        "stated_mm": None if noise.stated is None else 1e3 * noise.stated,
+        "joint_scatter_deg": None if noise.joint_scatter is None else float(np.degrees(noise.joint_scatter)),
+        "lack_of_fit_mm": 1e3 * noise.lack_of_fit,
+        "repeats": noise.repeats,
+        "p_value": noise.p_value,
+    }
+
+
+def doubtful_coordinates(run: Run) -> list[str]:
+    """What the surveys say against the coordinates that were given."""
+    record = run.record("survey")
+    surveys = dict(record.result).get("survey", {}) if record is not None else {}
+    return [doubt for entry in surveys.values() for doubt in entry.get("contradictions", [])]
 
 
 def _write_covariance(run: Run, calibrated: CalibratedRobot) -> None:

@@ -249,7 +249,11 @@ def _verification(
     rows: NDArray[np.int64],
 ) -> Verification:
     measured = degrees > 0
-    total = float(np.sum(square * degrees))
+    # repetitions of one another share what the model misses there: together they count as one pose
+    labels = np.unique(repetitions(poses.q)[rows][measured], return_inverse=True)[1]
+    weight = 1.0 / np.bincount(labels)[labels]
+    total = float(np.sum(weight * square[measured] * degrees[measured]))
+    freedom = float(np.sum(weight * degrees[measured]))
     inside = square[measured] * degrees[measured] <= stats.chi2.isf(0.05, degrees[measured])
     return Verification(
         kind=kind,
@@ -260,8 +264,8 @@ def _verification(
         nominal_errors=None if nominal is None else {name: e for name, (_, e) in nominal.items()},
         normalised=square,
         degrees=degrees,
-        p_value=float(stats.chi2.sf(total, max(1, int(degrees.sum())))),
-        coverage_95=float(inside.mean()) if inside.size else float("nan"),
+        p_value=float(stats.chi2.sf(total, max(1.0, freedom))),
+        coverage_95=float(np.average(inside, weights=weight)) if inside.size else float("nan"),
         predicted=np.sqrt(np.trace(C_T[:, :3, :3], axis1=1, axis2=2) / 3.0),
         iso=_pose_accuracy(poses, T, observations),
         rows=rows,

@@ -185,10 +185,16 @@ def summary(diagnosis: Diagnosis) -> str:
         if diagnosis.noise_estimated > 1.15 or diagnosis.noise_estimated < 0.85:
             text += f" (the data scatter {diagnosis.noise_estimated:.2f} times what their covariance says)"
         return text + "."
-    parts = [
-        f"{finding.statement}; it explains {finding.explained:.0%} of what was left" for finding in diagnosis.findings
-    ]
-    return ". ".join(parts) + "."
+    return ". ".join(_with_gain(finding, len(diagnosis.findings)) for finding in diagnosis.findings) + "."
+
+
+def _with_gain(finding: Finding, count: int) -> str:
+    """A statement with its share of the gain of all causes, or that poses kept out get no better by it."""
+    before, after = finding.heldout
+    if after >= before:
+        return f"{finding.statement}; poses kept out get no better by it"
+    share = f"; it is {finding.explained:.0%} of what all causes gain" if count > 1 else ""
+    return f"{finding.statement}{share}"
 
 
 def number(value: object) -> object:

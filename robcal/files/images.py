@@ -16,11 +16,15 @@ from numpy.typing import NDArray
 
 from robcal.errors import InvalidInput
 from robcal.files.storage import read_bytes
+from robcal.files.tiff import MAGIC, plain_tiff
 
 SUFFIXES = frozenset({".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp"})
 MAX_BYTES = 1_500_000_000
 MAX_PIXELS = 400_000_000
 MAX_DECODED_BYTES = 1_000_000_000
+
+TILES, LIT, COLOURED = 4, 0.02, 0.2
+"""Tiles a side in which a mosaic is looked for; shares of the grey scale that are lit, and by which colours differ."""
 
 GreyImage = NDArray[np.uint8 | np.uint16]
 
@@ -64,6 +68,9 @@ def read_image(path: Path) -> GreyImage:
     """
     raw = read_bytes(path, MAX_BYTES)
     _check_complete(path, raw)
+    inverted = False
+    if raw.startswith(MAGIC):
+        raw, inverted = plain_tiff(path, raw)
     try:
         with _silent_decoders():
             image = cv2.imdecode(np.frombuffer(raw, np.uint8), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
@@ -76,7 +83,27 @@ def read_image(path: Path) -> GreyImage:
     if image.ndim == 3:
         channels = image.shape[2]
         image = image[:, :, 0] if channels in (1, 2) else cv2.cvtColor(image[:, :, :3], cv2.COLOR_BGR2GRAY)
-    return np.ascontiguousarray(image, dtype=image.dtype)
+    grey: GreyImage = np.ascontiguousarray(image, dtype=image.dtype)
+    if mosaic(grey):
+        raise InvalidInput(
+            f"{path}: neighbouring pixels differ like the colours of a mosaic (Bayer pattern): develop it to grey "
+            "values, or record grey"
+        )
+    return np.invert(grey) if inverted else grey
+
+
+def mosaic(image: GreyImage) -> bool:
+    """Whether an image (h, w) is the colour mosaic of a sensor: everywhere one of four pixels is brighter by far."""
+    h, w = (size // (2 * TILES) * 2 * TILES for size in image.shape)
+    if min(h, w) < 8 * TILES:
+        return False
+    cells = image[:h, :w].reshape(TILES, h // (2 * TILES), 2, TILES, w // (2 * TILES), 2)
+    means = cells.mean(axis=(1, 4)).transpose(0, 2, 1, 3).reshape(-1, 4)
+    lit = means.mean(axis=1) > LIT * (255.0 if image.dtype == np.uint8 else 65535.0)
+    if np.count_nonzero(lit) < TILES:
+        return False
+    level = means[lit] / means[lit].mean(axis=1, keepdims=True)
+    return bool(np.all(np.ptp(level, axis=1) > COLOURED) and np.ptp(level, axis=0).max() < COLOURED)
 
 
 def _check_complete(path: Path, raw: bytes) -> None:
@@ -99,7 +126,7 @@ def _check_complete(path: Path, raw: bytes) -> None:
         bits = struct.unpack("<H", raw[28:30])[0]
         compressed = len(raw) >= 34 and struct.unpack("<I", raw[30:34])[0] not in (0, 3)
         truncated = not compressed and len(raw) < offset + (abs(width) * bits + 31) // 32 * 4 * abs(height)
-    elif not raw.startswith((b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")):
+    elif not raw.startswith(MAGIC):
         raise InvalidInput(f"{path}: is not a PNG, TIFF, JPEG or BMP image in spite of its name: convert or remove it")
     if abs(width) * abs(height) > MAX_PIXELS:
         raise InvalidInput(f"{path}: {abs(width)} x {abs(height)} pixels are more than {MAX_PIXELS}: crop the image")

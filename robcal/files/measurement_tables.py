@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from robcal.calibration.slips import empty_readings, frozen_readings
 from robcal.errors import InvalidInput
-from robcal.files.frame_tables import SIX, frame_covariance_columns, twist_from_six
+from robcal.files.frame_tables import SIX, frame_covariance_columns, twist_covariance
 from robcal.files.tables import Table, read_table
 from robcal.transforms import Array, frame_from_xyzrpy
 
@@ -23,6 +23,8 @@ IntArray = NDArray[np.int64]
 Kind = Literal["points", "frames", "distances", "sensor_points"]
 
 MAX_METRES = 10_000.0
+MOST_OUTSIDE = 0.2
+"""Share of the marks that may lie outside their image."""
 
 
 @dataclass(frozen=True)
@@ -257,8 +259,7 @@ def _frame_covariance(table: Table, six: Array) -> Array | None:
         table.require(["sigma_mm", "sigma_deg"])
     else:
         return None
-    jacobian = twist_from_six(six) * scale
-    return _positive_definite(table, jacobian @ numbers @ np.swapaxes(jacobian, 1, 2))
+    return _positive_definite(table, twist_covariance(six, numbers * np.outer(scale, scale)))
 
 
 def _check_size(table: Table, values: Array) -> None:
@@ -289,3 +290,27 @@ def read_marks(path: Path, default_sigma: float = 0.1) -> MarksTable:
     stated = table.has("sigma_px")
     sigma = table.numbers("sigma_px", positive=True) if stated else np.full(len(table), default_sigma)
     return MarksTable(path, image, target, xy, sigma, stated)
+
+
+def check_marks(marks: MarksTable, size: tuple[int, int] | None) -> None:
+    """Refuse marks that do not lie in the image.
+
+    Raises
+    ------
+    InvalidInput : many are beyond its edges; the message says what they look like.
+    """
+    outside = (marks.xy < -1.0).any(axis=1)
+    if size is not None:
+        outside |= (marks.xy > np.array(size, dtype=float)).any(axis=1)
+    if np.mean(outside) < MOST_OUTSIDE:
+        return
+    low, high = marks.xy.min(axis=0), marks.xy.max(axis=0)
+    spans = f"x_px from {low[0]:.0f} to {high[0]:.0f}, y_px from {low[1]:.0f} to {high[1]:.0f}"
+    negative = low < -0.1 * (high - low)
+    looks = "they seem to be counted from the centre of the image" if negative.all() else "check columns and image size"
+    if negative[1] and not negative[0]:
+        looks = "y seems to be counted upwards"
+    raise InvalidInput(
+        f"{marks.path}: {100 * np.mean(outside):.0f} % of the marks lie outside the image ({spans}): {looks}; count "
+        "x_px to the right and y_px downwards from the centre of the top left pixel"
+    )

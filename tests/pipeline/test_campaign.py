@@ -1,6 +1,7 @@
 """What reading a campaign refuses, and in which words."""
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from pipeline.campaign import read_campaign
 from pipeline.cli import app
 from pipeline.runner import run_campaign
 from robcal.errors import InvalidInput
+from robcal.files.measurement_tables import MarksTable, check_marks
 from tests.pipeline.conftest import Rows, edit_rows, edit_yaml
 
 
@@ -195,3 +197,20 @@ def test_poses_beyond_the_ranges_are_told_with_row_and_joint(point_campaign: Pat
         assert word in poses.outside
     with pytest.raises(InvalidInput, match=r"row 2: q1_deg = 300 deg lies outside.*the range in the robot file$"):
         run_campaign(point_campaign, point_campaign.parent / "run")
+
+
+@pytest.mark.parametrize(
+    ("shift", "sides", "words"),
+    [
+        ((-320, -256), (1, 1), "counted from the centre"),
+        ((-320, 256), (1, -1), "counted from the centre"),
+        ((0, 0), (1, -1), "y seems to be counted upwards"),
+        ((0, 0), (5, 5), "check columns and image size"),
+    ],
+)
+def test_marks_that_lie_in_no_image(shift: tuple[int, int], sides: tuple[int, int], words: str) -> None:
+    xy = np.random.default_rng(1).uniform([20, 20], [620, 490], (60, 2))
+    marks = MarksTable(Path("left.csv"), ("p1",) * 60, np.arange(60), xy, np.ones(60), False)
+    check_marks(marks, (640, 512))
+    with pytest.raises(InvalidInput, match=words):
+        check_marks(replace(marks, xy=xy * sides + shift), (640, 512))

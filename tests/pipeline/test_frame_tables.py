@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.frame_tables import frame_columns, frame_covariance_columns, sigma_columns, twist_from_six
+from robcal.files.frame_tables import frame_columns, frame_covariance_columns, sigma_columns, twist_from_six
 from robcal.transforms import difference, frame_from_xyzrpy
 
 SIX = np.random.default_rng(3).uniform(-1.2, 1.2, (7, 6))

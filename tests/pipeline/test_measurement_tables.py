@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.measurement_tables import read_measurements
 from robcal.errors import InvalidInput
+from robcal.files.measurement_tables import read_measurements
 
 POSES = ("a", "b")
 POINT = "pose,target,x_mm,y_mm,z_mm"

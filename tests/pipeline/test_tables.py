@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 from robcal.errors import InvalidInput
+from robcal.files.frame_tables import six_covariance, twist_covariance
 from robcal.files.tables import read_table, write_table
+from robcal.transforms import frame_from_xyzrpy, xyzrpy_from_frame
 
 
 def table(folder: Path, content: str | bytes) -> Path:
@@ -71,3 +73,17 @@ def test_round_trip(tmp_path: Path) -> None:
     read = read_table(tmp_path / "o.csv")
     assert read.texts("pose") == ("a", "b, c")
     np.testing.assert_allclose(read.numbers("x"), [0.1, 1 / 3], rtol=1e-11)
+
+
+@pytest.mark.parametrize("pitch", [90.0, -90.0, 89.99, 88.0, 60.0])
+def test_covariance_of_frames_at_any_pitch(pitch: float) -> None:
+    """Isotropic turns come back from their six numbers; at the lock they do so by convention."""
+    six = np.array([[1.0, 2.0, 3.0, *np.radians([20.0, pitch, -35.0])]])
+    T = frame_from_xyzrpy(six)
+    C = np.diag([1e-4**2] * 3 + [1e-4**2] * 3)[None]
+    back = twist_covariance(xyzrpy_from_frame(T), six_covariance(T, C))
+    assert np.allclose(back, C, rtol=1e-6, atol=1e-12)
+    stated = np.diag([6e-5**2] * 3 + [1e-4**2] * 3)[None]
+    values = np.linalg.eigvalsh(twist_covariance(six, stated)[0])
+    assert values[0] > 0
+    assert values[-1] < 4e-8

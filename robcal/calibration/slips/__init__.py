@@ -6,6 +6,6 @@ decimetres. So the nominal robot with the best base and tool is enough to tell.
 
 from robcal.calibration.slips.readings import empty_readings, frozen_readings
 from robcal.calibration.slips.recorded import Recorded, Slip, outside_limits
-from robcal.calibration.slips.search import find_slips
+from robcal.calibration.slips.search import find_slips, mirror_misses
 
-__all__ = ["Recorded", "Slip", "empty_readings", "find_slips", "frozen_readings", "outside_limits"]
+__all__ = ["Recorded", "Slip", "empty_readings", "find_slips", "frozen_readings", "mirror_misses", "outside_limits"]

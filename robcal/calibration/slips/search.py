@@ -104,3 +104,10 @@ def _proved(trials: Iterator[Trial], recorded: Recorded, few: Recorded, unmended
             text = f"{proof}{1e3 * after:.3g} mm"
             told.append(Slip(trial.kind, trial.where, text, trial.remedy, whole, after, {}))
     return told
+
+
+def mirror_misses(model: RobotModel, poses: PoseInputs, observations: Sequence[Observations]) -> tuple[float, float]:
+    """Miss (m) of the nominal robot with the measurements as they are, and with their mirror image."""
+    plain = Recorded.of(model, poses, observations)
+    mirrored = [miss(trial.mend(plain)) for trial in mirror_trials(plain)]
+    return miss(replace(plain, observations=as_frames(observations))), min(mirrored, default=np.inf)

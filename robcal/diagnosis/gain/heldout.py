@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from robcal.calibration.identifiability import repetitions
 from robcal.calibration.observations import DistanceObservations, FrameObservations, PointObservations
 from robcal.diagnosis.core.fitting import Accepted, Fit, solve
 from robcal.diagnosis.core.recording import Recording, observation_data
@@ -57,10 +58,17 @@ def rms(errors: Array) -> float:
 
 
 def folds(recording: Recording, count: int = FOLDS) -> Array:
-    """Fold of each pose (n,): blocks of consecutive poses, so that slow effects and repeats stay together."""
+    """Fold of each pose (n,): blocks of consecutive poses, so that slow effects stay together.
+
+    Repetitions of one another lie in the fold of the first of them, whenever they were driven.
+    """
     order = np.argsort(np.argsort(recording.covariates["index"]))
     blocks = min(2 * count, len(order))
-    return (order * blocks // len(order)) % count
+    labels = (order * blocks // len(order)) % count
+    same = repetitions(recording.q)
+    first = np.full(int(same.max(initial=-1)) + 1, len(order))
+    np.minimum.at(first, same, order)
+    return np.asarray(labels[np.argsort(order)][first[same]])
 
 
 def cross_validated(recording: Recording, fitted: Fit, labels: Array) -> Array:
