@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.robot_file import read_robot
+from robcal.files.robot_file import read_robot
 from robcal.robot.chain import chain_of, forward
 from robcal.robot.compensation import CompensationSettings, cell_frames, compensate
 from robcal.robot.export.c_export import export_c

@@ -46,12 +46,14 @@ CAMPAIGNS: Mapping[str, Callable[[Path], object]] = {
 
 @dataclass(frozen=True)
 class Agreement:
-    """How two files agree: numbers compared, the first key that differs, the largest relative difference, sentences."""
+    """How two files agree: numbers compared, the first key that differs, the largest relative difference, sentences
+    that differ, keys that only the new one has."""
 
     numbers: int
     first: str | None
     largest: float
     texts: int
+    added: int
 
 
 def leaves(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
@@ -78,11 +80,11 @@ def relative_difference(a: float, b: float, key: str = "") -> float:
 
 
 def compare(old: Any, new: Any, tolerance: float) -> Agreement:
-    """Two nested structures, number by number. A key of one only, or another type, is an infinite difference."""
+    """Two nested structures, number by number. A key that is gone, or another type, is an infinite difference."""
     mine, theirs = dict(leaves(new)), dict(leaves(old))
     first, largest, texts, numbers = None, 0.0, 0, 0
-    for key in [*theirs, *(k for k in mine if k not in theirs)]:
-        a, b = theirs.get(key, compare), mine.get(key, compare)
+    for key, a in theirs.items():
+        b = mine.get(key, compare)
         if isinstance(a, str) and isinstance(b, str):
             texts += a != b
             continue
@@ -94,7 +96,7 @@ def compare(old: Any, new: Any, tolerance: float) -> Agreement:
         largest = max(largest, difference)
         if difference > tolerance and first is None:
             first = key
-    return Agreement(numbers, first, largest, texts)
+    return Agreement(numbers, first, largest, texts, len(mine.keys() - theirs.keys()))
 
 
 def _is_number(value: Any) -> bool:
@@ -139,8 +141,10 @@ def main() -> int:
     parser.add_argument("--keep-old", action="store_true", help="do not run the old version where its results lie")
     given = parser.parse_args()
     cache = given.cache.resolve()
-    print(f"| {'campaign':24} | {'file':14} | numbers | largest difference | sentences | first key that differs |")
-    print(f"|{'-' * 26}|{'-' * 16}|---------|--------------------|-----------|------------------------|")
+    print(
+        f"| {'campaign':24} | {'file':14} | numbers | largest difference | sentences | added | first key that differs |"
+    )
+    print(f"|{'-' * 26}|{'-' * 16}|---------|--------------------|-----------|-------|------------------------|")
     different = False
     for name, campaign in campaigns(cache, given.recorded and given.recorded.resolve()).items():
         if given.only and name not in given.only:
@@ -163,7 +167,7 @@ def main() -> int:
             different |= found.first is not None
             print(
                 f"| {name:24} | {file:14} | {found.numbers:7d} | {found.largest:18.1e} | {found.texts:9d} |"
-                f" {found.first or 'none'} |",
+                f" {found.added:5d} | {found.first or 'none'} |",
                 flush=True,
             )
     return int(different)

@@ -11,7 +11,7 @@ from pipeline import artifacts
 from pipeline.bodies import surveyed_or_given
 from pipeline.campaign import Campaign
 from pipeline.runs import Run
-from pipeline.tables import read_table
+from robcal.files.tables import read_table
 from robcal.recipe.image_findings import ImageFindings, StationResult, SurveyImages, image_findings
 from robcal.recipe.station import StationImages
 from robcal.transforms import Array

@@ -8,12 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.body_file import BodyFile, check_ring_codes, read_body
-from pipeline.camera_file import CameraFile, read_camera
-from pipeline.camera_import import split_choice
 from pipeline.campaign_schema import FORMAT, CampaignEntry, StationCameraEntry, SurveyEntry
-from pipeline.images import list_images
-from pipeline.measurement_tables import (
+from robcal.errors import InvalidInput
+from robcal.files.body_file import BodyFile, check_ring_codes, read_body
+from robcal.files.camera_file import CameraFile, read_camera
+from robcal.files.camera_import import split_choice
+from robcal.files.images import list_images
+from robcal.files.measurement_tables import (
     MarksTable,
     MeasuredTable,
     check_marks,
@@ -21,11 +22,10 @@ from pipeline.measurement_tables import (
     read_measurements,
     without_frozen,
 )
-from pipeline.poses_table import Poses, read_poses
-from pipeline.robot_import import read_any_robot
-from pipeline.schemas import parse, proposal
-from pipeline.yaml_io import YamlDocument, read_yaml
-from robcal.errors import InvalidInput
+from robcal.files.poses_table import Poses, read_poses
+from robcal.files.robot_import import read_any_robot
+from robcal.files.schemas import parse, proposal
+from robcal.files.yaml_io import YamlDocument, read_yaml
 from robcal.physics.gravity_sag import without_masses
 from robcal.robot.chain import chain_of, forward
 from robcal.robot.model import RobotModel

@@ -6,8 +6,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field
 
-from pipeline.robot_file import PayloadEntry
-from pipeline.schemas import Entry, NotNegative, Positive, Text, Whole
+from robcal.files.robot_file import PayloadEntry
+from robcal.files.schemas import Entry, NotNegative, Positive, Text, Whole
 
 FORMAT = "robcal/campaign-1"
 

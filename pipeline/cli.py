@@ -76,7 +76,7 @@ def _wrong_use(sentence: str) -> None:
 
 def _check_stages(start: str | None, until: str | None) -> None:
     from pipeline.runner import STAGE_NAMES
-    from pipeline.schemas import proposal
+    from robcal.files.schemas import proposal
 
     for name in (until, start):
         if name is not None and name not in STAGE_NAMES:

@@ -18,8 +18,8 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from pipeline.files import write_atomic
 from robcal.errors import InvalidInput, RobcalError
+from robcal.files.storage import write_atomic
 
 _MODULES = ("robcal.", "pipeline.")
 _STRUCTURE = "structure"

@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.campaign import read_campaign
-from pipeline.files import storage_error
 from pipeline.json_io import read_json
 from pipeline.messages import LOG
 from pipeline.runner import Done, run_campaign
 from pipeline.runs import campaign_of, is_run, open_run
-from pipeline.schemas import proposal
 from robcal.errors import InvalidInput
+from robcal.files.schemas import proposal
+from robcal.files.storage import storage_error
 
 
 def survey_campaign(path: Path, body: str | None, out: Path | None, workers: int | None) -> Done:

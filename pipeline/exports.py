@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pipeline.files import write_text
 from pipeline.runs import open_run
 from pipeline.stages.identify import load_calibrated
+from robcal.files.storage import write_text
 from robcal.robot.export.c_export import export_c
 from robcal.robot.export.urdf import urdf_text
 

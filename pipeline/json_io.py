@@ -8,8 +8,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pipeline.files import write_text
 from robcal.errors import InvalidInput
+from robcal.files.storage import write_text
 
 
 def write_json(path: Path, data: Mapping[str, Any]) -> None:

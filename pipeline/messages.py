@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeVar
 
-from pipeline.files import storage_error
+from robcal.files.storage import storage_error
 
 T = TypeVar("T")
 

@@ -9,20 +9,19 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field
 
-from pipeline.bodies import body_from_file
-from pipeline.body_file import read_body
-from pipeline.camera_file import read_camera
-from pipeline.poses_table import joint_columns
-from pipeline.robot_file import PayloadEntry, PlacementEntry
-from pipeline.robot_import import read_any_robot
-from pipeline.schemas import Entry, NotNegative, Number, Positive, Text, Triple, Whole, read_entry
-from pipeline.tables import write_table
 from robcal.calibration.collision import Ball, Box, Capsule, HalfSpace, Obstacle, link_capsules
 from robcal.calibration.pose_candidates import Cell
 from robcal.calibration.poses import PosePlan, PoseRequest
 from robcal.calibration.poses import generate_poses as plan_poses
 from robcal.calibration.visibility import Viewpoint, VisibilityRules
 from robcal.errors import InvalidInput
+from robcal.files.body_file import body_from_file, read_body
+from robcal.files.camera_file import read_camera
+from robcal.files.poses_table import joint_columns
+from robcal.files.robot_file import PayloadEntry, PlacementEntry
+from robcal.files.robot_import import read_any_robot
+from robcal.files.schemas import Entry, NotNegative, Number, Positive, Text, Triple, Whole, read_entry
+from robcal.files.tables import write_table
 from robcal.robot.model import RobotModel
 from robcal.transforms import Array
 

@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.files import write_text
-from pipeline.frame_tables import SIX, frame_columns, sigma_columns
-from pipeline.poses_table import joint_columns, parse_payload, read_poses
 from pipeline.runs import open_run
 from pipeline.stages.identify import load_calibrated
-from pipeline.tables import read_table, write_table
 from robcal.errors import InvalidInput
+from robcal.files.frame_tables import SIX, frame_columns, sigma_columns
+from robcal.files.poses_table import joint_columns, parse_payload, read_poses
+from robcal.files.storage import write_text
+from robcal.files.tables import read_table, write_table
 from robcal.robot.compensation import cell_frames, compensate
 from robcal.robot.export.controller_formats import frame_program, joint_program, program_name
 from robcal.transforms import Array, frame_from_xyzrpy

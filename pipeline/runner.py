@@ -11,16 +11,16 @@ from typing import Any
 
 from pipeline.campaign import Campaign, all_sources, read_campaign
 from pipeline.codec import StaleCache
-from pipeline.files import storage_error
 from pipeline.json_io import fingerprint, read_json, write_json
 from pipeline.messages import LOG, logged_to
 from pipeline.runs import RUN_FORMAT, Run, StageRecord, run_file
-from pipeline.schemas import proposal
 from pipeline.sources import code_version
 from pipeline.stages.base import Context, Outcome, Stage
 from pipeline.stages.identify import check_joint_limits
 from pipeline.stages.registry import STAGES
 from robcal.errors import InvalidInput, RobcalError
+from robcal.files.schemas import proposal
+from robcal.files.storage import storage_error
 
 STAGE_NAMES = tuple(stage.name for stage in STAGES)
 

@@ -17,9 +17,9 @@ from filelock import FileLock, Timeout
 
 from pipeline import codec
 from pipeline.artifacts import Artifact
-from pipeline.files import sha256_of, storage_error
 from pipeline.json_io import read_json, write_json
 from robcal.errors import InvalidInput, RobcalError
+from robcal.files.storage import sha256_of, storage_error
 
 RECORD_FORMAT = "robcal/stage-record-1"
 RUN_FORMAT = "robcal/run-1"

@@ -130,7 +130,7 @@ def library(folder: Path, tables: Mapping[str, Path]) -> Answer:
 def _predicted(
     model: Any, campaign: Any, recorded: Mapping[str, Array], tables: Mapping[str, Path]
 ) -> dict[str, Array]:
-    from pipeline.poses_table import read_poses
+    from robcal.files.poses_table import read_poses
     from robcal.robot.kernel import Kernel
 
     kernel = Kernel(model, "converged")

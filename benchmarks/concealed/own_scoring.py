@@ -180,7 +180,7 @@ def _fitted(folder: Path, run: Any) -> Any:
 
 
 def _predicted(calibrated: Any, table: Path) -> Array:
-    from pipeline.poses_table import read_poses
+    from robcal.files.poses_table import read_poses
 
     poses = read_poses(table, calibrated.model, calibrated.model.payloads, to_predict=True)
     frames: Array = calibrated.predict(calibrated.inputs(poses))[0]

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pipeline.files import write_text
 from pipeline.report.chapters import all_chapters
 from pipeline.report.material import Material
 from pipeline.report.page import render
 from pipeline.report.provenance import provenance
 from pipeline.report.verdict import verdict_of
 from pipeline.runs import Run
+from robcal.files.storage import write_text
 
 
 def write_report(run: Run) -> Path:

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.artifacts import detections
-from pipeline.images import read_image
 from pipeline.report.blocks import Block, Chapter, Figure, Picture, Pictures, table
 from pipeline.report.material import Material
 from pipeline.report.style import AFTER, GREY, label, layout, number
 from robcal.errors import RobcalError
+from robcal.files.images import read_image
 from robcal.imaging.detections import CodeState, Detections
 from robcal.transforms import Array
 

@@ -9,10 +9,8 @@ from pathlib import Path
 
 from pipeline import codec
 from pipeline.artifacts import DETECTED, detections
-from pipeline.body_file import BodyFile
 from pipeline.campaign import Campaign, ImageSource
 from pipeline.campaign_schema import SurveyEntry
-from pipeline.images import read_image
 from pipeline.json_io import fingerprint
 from pipeline.messages import track
 from pipeline.parallel import in_processes
@@ -20,6 +18,8 @@ from pipeline.runs import Run
 from pipeline.sources import code_version
 from pipeline.stages.base import Context, Outcome, Stage
 from robcal.errors import InvalidInput, RobcalError
+from robcal.files.body_file import BodyFile
+from robcal.files.images import read_image
 from robcal.imaging.detect import detect_targets
 from robcal.imaging.detections import Detections
 from robcal.imaging.settings import DetectionSettings
@@ -144,7 +144,7 @@ def work(context: Context) -> Outcome:
     campaign, run = context.campaign, context.run
     jobs: list[_Job] = []
     hashes: dict[str, dict[str, str]] = {}
-    version = code_version("pipeline.images", "robcal.imaging.detect")
+    version = code_version("robcal.files.images", "robcal.imaging.detect")
     for source, (images, body, survey) in sources(campaign).items():
         settings = settings_for(body, survey)
         for name, path in images.images.items():

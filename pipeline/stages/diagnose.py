@@ -13,11 +13,11 @@ from pipeline.campaign import Campaign
 from pipeline.json_io import write_json
 from pipeline.messages import LOG
 from pipeline.stages.base import Context, Outcome, Stage, no_files
-from pipeline.tables import write_table
 from robcal.diagnosis.content import diagnosis_content, with_images
 from robcal.diagnosis.core.result import Diagnosis
 from robcal.diagnosis.images.diagnosis import ImageFinding
 from robcal.diagnosis.search.selection import SelectionSettings
+from robcal.files.tables import write_table
 from robcal.recipe.robot_diagnosis import Measured, RobotDiagnosis, diagnose_robot
 from robcal.recipe.robot_witness import with_station_moves
 

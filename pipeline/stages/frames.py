@@ -9,12 +9,12 @@ import numpy as np
 from pipeline.artifacts import FRAMES, ORIENTATION, POINTS
 from pipeline.bodies import surveyed_or_given
 from pipeline.campaign import Campaign
-from pipeline.frame_tables import frame_columns, frame_covariance_columns, six_covariance
-from pipeline.poses_table import Poses
 from pipeline.runs import Run
 from pipeline.stages.base import Context, Outcome, Stage
-from pipeline.tables import write_table
 from robcal.errors import InvalidInput
+from robcal.files.frame_tables import frame_columns, frame_covariance_columns, six_covariance
+from robcal.files.poses_table import Poses
+from robcal.files.tables import write_table
 from robcal.photogrammetry.core.bodies import Body, line_ratio
 from robcal.photogrammetry.measure.frames import MeasuredFrames, measure_frames
 from robcal.photogrammetry.measure.measured_points import MeasuredPoints

@@ -9,8 +9,6 @@ import numpy as np
 from pipeline.artifacts import CALIBRATED, IDENTIFICATION
 from pipeline.bodies import body_for_robot
 from pipeline.campaign import Campaign
-from pipeline.poses_table import Poses
-from pipeline.robot_file import write_robot
 from pipeline.runs import Run
 from pipeline.stages.base import Context, Outcome, Stage
 from pipeline.stages.observations import build_recording
@@ -21,6 +19,8 @@ from robcal.calibration.measurements import RobotRecording, Rows
 from robcal.calibration.recording_faults import fault_of
 from robcal.calibration.slips import mirror_misses
 from robcal.errors import InvalidInput, RobcalError
+from robcal.files.poses_table import Poses
+from robcal.files.robot_file import write_robot
 from robcal.photogrammetry.survey.given_coordinates import GivenCoordinates
 from robcal.recipe.identification import identify_robot
 from robcal.robot.kernel import Kernel

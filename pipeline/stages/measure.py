@@ -6,12 +6,12 @@ import numpy as np
 
 from pipeline.artifacts import POINTS
 from pipeline.campaign import Campaign
-from pipeline.poses_table import Poses
 from pipeline.runs import Run
 from pipeline.stages.base import Context, Outcome, Stage
 from pipeline.stages.orient import station_points
-from pipeline.tables import write_table
 from robcal.errors import InvalidInput
+from robcal.files.poses_table import Poses
+from robcal.files.tables import write_table
 from robcal.photogrammetry.measure.measured_points import MeasuredPoints
 
 NAME = "measure"

@@ -13,16 +13,16 @@ import numpy as np
 from pipeline.adjusted_images import image_covariates
 from pipeline.artifacts import CORRECTED_IMAGES, DETECTED, MARKS, ORIENTATION, SHAPES
 from pipeline.bodies import surveyed_or_given
-from pipeline.camera_file import CameraFile, write_camera
 from pipeline.campaign import Campaign, ImageSource
-from pipeline.measurement_tables import MarksTable
-from pipeline.poses_table import Poses
 from pipeline.runs import Run
 from pipeline.stages.base import Context, Outcome, Stage
 from pipeline.stages.detect import load_detections
 from pipeline.stages.identify import options_of
 from pipeline.stages.survey import located, size_of_marks
 from robcal.errors import InvalidInput, RobcalError
+from robcal.files.camera_file import CameraFile, write_camera
+from robcal.files.measurement_tables import MarksTable
+from robcal.files.poses_table import Poses
 from robcal.imaging.detections import Detections
 from robcal.photogrammetry.core.bodies import Body
 from robcal.photogrammetry.core.camera import INTRINSIC_NAMES, Camera

@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 
 from pipeline import artifacts
-from pipeline.body_file import BodyFile, write_body
-from pipeline.camera_file import CameraFile, write_camera
 from pipeline.campaign import BodySource, Campaign, ImageSource
 from pipeline.campaign_schema import CheckLengthEntry, FixedDatum, ScaleBarEntry, SurveyEntry
-from pipeline.measurement_tables import MarksTable
 from pipeline.runs import Run
 from pipeline.stages.base import Context, Outcome, Stage
 from pipeline.stages.detect import load_detections, sizes
 from robcal.errors import DegenerateGeometry, InvalidInput, NotIdentifiable, RobcalError
+from robcal.files.body_file import BodyFile, write_body
+from robcal.files.camera_file import CameraFile, write_camera
+from robcal.files.measurement_tables import MarksTable
 from robcal.photogrammetry.bundle.colmap_engine import export_colmap
 from robcal.photogrammetry.core.bodies import Body
 from robcal.photogrammetry.core.camera import INTRINSIC_NAMES

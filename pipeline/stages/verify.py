@@ -10,13 +10,10 @@ import numpy as np
 from pipeline import artifacts
 from pipeline.codec import save_arrays
 from pipeline.json_io import read_json
-from pipeline.poses_table import Poses
-from pipeline.robot_file import write_robot
 from pipeline.runs import Run
 from pipeline.stages.base import Context, Outcome, Stage, no_files
 from pipeline.stages.identify import load_calibrated, options_of, require_robot
 from pipeline.stages.survey import located
-from pipeline.tables import write_table
 from robcal.calibration.calibrated import CalibratedRobot
 from robcal.calibration.measurements import RobotObservations
 from robcal.calibration.noise_parts import NoiseParts
@@ -29,6 +26,9 @@ from robcal.calibration.observations import (
 from robcal.calibration.verdict import verdict
 from robcal.calibration.verification import ErrorStatistics
 from robcal.errors import InvalidInput
+from robcal.files.poses_table import Poses
+from robcal.files.robot_file import write_robot
+from robcal.files.tables import write_table
 from robcal.recipe.noise import noise_of
 from robcal.recipe.verdict import robot_facts
 from robcal.recipe.verification import RobotVerification, datum_note, verify_robot

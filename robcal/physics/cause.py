@@ -98,7 +98,8 @@ class LinearCause(Cause):
     ordered : constants with a long list of values of which the grid holds a part; refined among the values nearby.
     positive : prior probability that the amplitude is positive (one parameter only): things deflect and grow, rarely
         the reverse.
-    limits : lowest and highest amplitude that can be. first_must_show : whether the first one must be clear of zero.
+    limits : lowest and highest amplitude that can be. known_within : largest standard deviation of the first one with
+        which the data say anything of it.
     weight : prior weight (a kind that may act at many places shares one weight among them).
     covariates : variables that the law follows.
     default_prior : typical size of amplitudes whose number depends on the constants.
@@ -118,7 +119,7 @@ class LinearCause(Cause):
     ordered: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     positive: float = 0.5
     limits: tuple[float, float] = (-np.inf, np.inf)
-    first_must_show: bool = False
+    known_within: float = np.inf
     weight: float = 1.0
     covariates: tuple[str, ...] = ()
     default_prior: float = 1.5e-4

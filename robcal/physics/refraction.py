@@ -97,7 +97,7 @@ def _bent_sight(data: ObservationData, axis: int) -> ObservationCause:
         observation_shift=_warping(bent),
         weight=0.125,
         limits=(-1e-3, 1e-3),
-        first_must_show=True,
+        known_within=1e-4,
     )
 
 

@@ -43,7 +43,7 @@ class Identification:
 
 
 def identify_robot(
-    model: RobotModel, log: JointLog, recording: RobotRecording, options: IdentifyOptions
+    model: RobotModel, log: JointLog, recording: RobotRecording, options: IdentifyOptions | None = None
 ) -> Identification:
     """Identify a robot from the measured poses that are not kept out.
 
@@ -55,6 +55,7 @@ def identify_robot(
     rows = np.array([i for i in recording.poses if not log.verify[i]], dtype=np.int64)
     if not len(rows):
         raise InvalidInput("no measured pose is left to identify from: set 'identify' in the column set")
+    options = options or IdentifyOptions()
     kernel = Kernel(model, options.statics)
     inputs = log.inputs(kernel)
     slips = check_joint_log(model, inputs, recording, kernel)

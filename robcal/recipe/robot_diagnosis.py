@@ -79,13 +79,14 @@ class RobotDiagnosis:
 def diagnose_robot(
     found: Identification,
     log: JointLog,
-    measured: Measured,
-    images: ImageFindings,
-    settings: SelectionSettings,
+    measured: Measured | None = None,
+    images: ImageFindings | None = None,
+    settings: SelectionSettings | None = None,
     tell: Callable[[str], None] = lambda text: None,
 ) -> RobotDiagnosis | None:
     """Diagnose an identified robot; verification poses only measure the gain. None where nothing can be diagnosed."""
     robot = found.robot
+    measured, settings = measured or Measured(), settings or SelectionSettings()
     # all of them: what a few poses have against the others may be a blunder, or an effect of one place in the workspace
     recording = measured.recording(log, found.recording, found.rows)
     verify = measured.recording(log, found.recording, found.kept_out(log))
@@ -95,7 +96,7 @@ def diagnose_robot(
     if recording.own_station:
         # told apart from the errors of the station, the frames show elasticities that were lost in them
         free, tied = (*robot.names, *own_elasticities(robot)), tuple(robot.eliminated)
-    uncorrected = [f for f in images.findings if f not in images.corrected]
+    uncorrected = [] if images is None else [f for f in images.findings if f not in images.corrected]
     diagnosis = diagnose(
         robot.model,
         recording,

@@ -51,7 +51,7 @@ def verify_robot(
     identification: Identification,
     robot: CalibratedRobot,
     log: JointLog,
-    options: IdentifyOptions,
+    options: IdentifyOptions | None = None,
     freed: RobotRecording | None = None,
     relative: Array | None = None,
 ) -> RobotVerification:
@@ -63,6 +63,7 @@ def verify_robot(
     freed : the measurements without what the diagnosis found in the measuring system.
     relative : covariance (p, p) of the robot's parameters against frames of the own station.
     """
+    options = options or IdentifyOptions()
     rows, recording = identification.sound, identification.recording
     stated, inputs = robot.inputs(log.as_stated()), log.inputs(robot.kernel)
     kept_out, notes = well_measured(recording, identification.kept_out(log), log.names)

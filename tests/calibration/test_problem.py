@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.robot_file import read_robot
 from robcal.calibration.observations import FrameObservations, Stack
 from robcal.calibration.problem import CellEvaluator, Evaluator, State
+from robcal.files.robot_file import read_robot
 from robcal.robot.kernel import Kernel
 from robcal.transforms import frame_from_xyzrpy
 

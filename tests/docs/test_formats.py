@@ -7,10 +7,10 @@ from typing import Any, get_args
 import pytest
 from pydantic import BaseModel
 
-from pipeline.body_file import BodyEntry
-from pipeline.camera_file import CameraEntry
 from pipeline.campaign_schema import CampaignEntry
-from pipeline.robot_file import RobotEntry
+from robcal.files.body_file import BodyEntry
+from robcal.files.camera_file import CameraEntry
+from robcal.files.robot_file import RobotEntry
 from robcal.physics.library import kinds
 
 PAGE = (Path(__file__).parents[2] / "docs" / "formats.md").read_text(encoding="utf-8")

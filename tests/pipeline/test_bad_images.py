@@ -9,9 +9,9 @@ import pytest
 from typer.testing import CliRunner
 
 from pipeline.cli import app
-from pipeline.images import read_image
 from pipeline.runner import run_campaign
 from robcal.errors import RobcalError
+from robcal.files.images import read_image
 from tests.pipeline.conftest import edit_rows, edit_yaml
 
 

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.robot_file import read_robot
 from robcal.calibration.calibrated import CalibratedRobot, with_folded_cell
 from robcal.calibration.joint_log import JointLog
+from robcal.files.robot_file import read_robot
 from robcal.robot.kernel import Kernel
 from robcal.transforms import frame_from_xyzrpy
 

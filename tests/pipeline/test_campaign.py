@@ -10,9 +10,9 @@ from typer.testing import CliRunner
 
 from pipeline.campaign import read_campaign
 from pipeline.cli import app
-from pipeline.measurement_tables import MarksTable, check_marks
 from pipeline.runner import run_campaign
 from robcal.errors import InvalidInput
+from robcal.files.measurement_tables import MarksTable, check_marks
 from tests.pipeline.conftest import Rows, edit_rows, edit_yaml
 
 

@@ -5,12 +5,12 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.body_file import check_ring_codes, read_body
 from pipeline.campaign_schema import FORMAT, CampaignEntry
-from pipeline.poses_table import read_poses
-from pipeline.robot_file import read_robot
-from pipeline.schemas import parse
-from pipeline.yaml_io import read_yaml
+from robcal.files.body_file import check_ring_codes, read_body
+from robcal.files.poses_table import read_poses
+from robcal.files.robot_file import read_robot
+from robcal.files.schemas import parse
+from robcal.files.yaml_io import read_yaml
 
 PAGE = Path(__file__).parents[2] / "docs" / "campaigns.md"
 

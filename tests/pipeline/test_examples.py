@@ -4,12 +4,12 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.body_file import check_ring_codes, read_body
-from pipeline.camera_file import read_camera
 from pipeline.campaign_schema import FORMAT, CampaignEntry
-from pipeline.robot_file import read_robot
-from pipeline.schemas import parse
-from pipeline.yaml_io import read_yaml
+from robcal.files.body_file import check_ring_codes, read_body
+from robcal.files.camera_file import read_camera
+from robcal.files.robot_file import read_robot
+from robcal.files.schemas import parse
+from robcal.files.yaml_io import read_yaml
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 

@@ -19,8 +19,8 @@ from pipeline.exports import export_run
 from pipeline.prediction import compensate_run, predict_run
 from pipeline.runner import run_campaign
 from pipeline.runs import open_run
-from pipeline.tables import read_table
 from robcal.errors import InvalidInput
+from robcal.files.tables import read_table
 from robcal.robot.model import Term
 from tests.pipeline.conftest import edit_yaml
 

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 import yaml
 
-from pipeline.camera_file import read_camera
 from pipeline.campaign import read_campaign
-from pipeline.robot_import import read_any_robot
 from robcal.errors import InvalidInput
+from robcal.files.camera_file import read_camera
+from robcal.files.robot_import import read_any_robot
 from robcal.photogrammetry.core.camera import Camera
 from robcal.robot.chain import chain_of, forward
 from robcal.robot.export.urdf import urdf_text

@@ -15,7 +15,6 @@ from fixtures.own_station import OwnPlan, kept_out_frames
 from fixtures.signature import tip_error_mm
 from pipeline.artifacts import IDENTIFICATION, ORIENTATION
 from pipeline.campaign import read_campaign
-from pipeline.poses_table import read_poses
 from pipeline.runner import run_campaign
 from pipeline.runs import Run
 from pipeline.stages.identify import load_calibrated
@@ -23,6 +22,7 @@ from robcal.calibration.calibrated import CalibratedRobot
 from robcal.diagnosis.images.camera_moves import epochs_of
 from robcal.diagnosis.images.diagnosis import ImageFinding
 from robcal.diagnosis.search.selection import SelectionSettings
+from robcal.files.poses_table import read_poses
 from robcal.physics.library import kinds
 from robcal.recipe.recording import common_errors
 from robcal.recipe.robot_diagnosis import settings_beside

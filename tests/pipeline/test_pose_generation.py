@@ -9,9 +9,9 @@ import pytest
 import yaml
 
 from pipeline.pose_generation import generate_poses, read_request
-from pipeline.poses_table import read_poses
 from robcal.calibration.pose_candidates import check_poses
 from robcal.errors import InvalidInput
+from robcal.files.poses_table import read_poses
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 

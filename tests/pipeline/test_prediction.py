@@ -9,8 +9,8 @@ import pytest
 from fixtures.campaigns import make_campaign
 from pipeline.prediction import compensate_run, predict_run
 from pipeline.runner import run_campaign
-from pipeline.tables import read_table
 from robcal.errors import InvalidInput
+from robcal.files.tables import read_table
 from tests.pipeline.conftest import edit_yaml
 
 

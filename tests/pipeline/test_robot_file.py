@@ -4,8 +4,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.robot_file import read_robot, robot_text, write_robot
 from robcal.errors import InvalidInput
+from robcal.files.robot_file import read_robot, robot_text, write_robot
 from robcal.robot.model import Term
 from robcal.transforms import frame_from_xyzrpy
 

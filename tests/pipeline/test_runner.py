@@ -10,12 +10,13 @@ from pathlib import Path
 
 import pytest
 
-from pipeline import codec, files, runner
+from pipeline import codec, runner
 from pipeline.runner import STAGE_NAMES, run_campaign
 from pipeline.runs import Run, RunLocked, StageRecord
 from pipeline.stages.base import Context, Outcome, Stage
 from pipeline.stages.registry import STAGES
 from robcal.errors import InvalidInput
+from robcal.files import storage
 from tests.pipeline.conftest import edit_yaml
 
 
@@ -99,12 +100,12 @@ def test_full_disk_and_missing_permission_are_told(
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(files.os, "fsync", full)
-    with pytest.raises(files.StorageError, match="disk is full"):
+    monkeypatch.setattr(storage.os, "fsync", full)
+    with pytest.raises(storage.StorageError, match="disk is full"):
         run_campaign(point_campaign, tmp_path / "run", until="measure")
     monkeypatch.undo()
     (tmp_path / "file").write_text("")
-    with pytest.raises(files.StorageError, match="a file stands where a folder is needed"):
+    with pytest.raises(storage.StorageError, match="a file stands where a folder is needed"):
         run_campaign(point_campaign, tmp_path / "file" / "run", until="measure")
 
 
@@ -117,7 +118,7 @@ def _killed(campaign: Path, out: Path, stage: str, when: str, until: str) -> Non
     def dying(original: Stage) -> Stage:
         def work(context: Context) -> Outcome:
             if when == "first write":
-                files.os.replace = kill  # type: ignore[assignment]
+                storage.os.replace = kill  # type: ignore[assignment]
             outcome = original.work(context)
             kill()
             return outcome

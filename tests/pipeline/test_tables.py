@@ -3,9 +3,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.frame_tables import six_covariance, twist_covariance
-from pipeline.tables import read_table, write_table
 from robcal.errors import InvalidInput
+from robcal.files.frame_tables import six_covariance, twist_covariance
+from robcal.files.tables import read_table, write_table
 from robcal.transforms import frame_from_xyzrpy, xyzrpy_from_frame
 
 

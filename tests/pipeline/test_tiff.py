@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.images import read_image
 from robcal.errors import InvalidInput
+from robcal.files.images import read_image
 
 Tags = dict[int, int]
 

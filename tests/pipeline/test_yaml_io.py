@@ -5,8 +5,8 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.yaml_io import FlowMapping, read_yaml, yaml_text
 from robcal.errors import InvalidInput
+from robcal.files.yaml_io import FlowMapping, read_yaml, yaml_text
 
 
 def written(folder: Path, text: str) -> Path:

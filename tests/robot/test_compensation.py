@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.robot_file import read_robot
 from robcal.errors import InvalidInput
+from robcal.files.robot_file import read_robot
 from robcal.robot.chain import chain_of, forward
 from robcal.robot.compensation import CompensationSettings, cell_frames, compensate
 from robcal.robot.inverse import inverse_kinematics, select

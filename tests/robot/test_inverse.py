@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.robot_file import read_robot
 from robcal.errors import InvalidInput
+from robcal.files.robot_file import read_robot
 from robcal.robot.chain import Chain, chain_of, forward, forward_and_jacobian
 from robcal.robot.inverse import SINGULAR_CONDITION, conditioning, follow, inverse_kinematics, select
 from robcal.robot.kernel import Kernel

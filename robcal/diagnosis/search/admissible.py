@@ -52,13 +52,11 @@ def refusal(item: Accepted, before: Fit, after: Fit, at: Tangents) -> str | None
 
 
 def possible(item: Accepted, fitted: Fit) -> bool:
-    """Whether the amplitudes have signs and sizes that physics allows, and the first one is known at all."""
+    """Whether the amplitudes have signs and sizes that physics allows, and the data tell the first one."""
     low, high = item.cause.limits
     if not np.all((item.values >= low) & (item.values <= high)):
         return False
-    if not item.cause.first_must_show:
-        return True
-    return bool(abs(item.values[0]) > SURE * np.sqrt(item.covariance[0, 0] * fitted.variance_factor))
+    return bool(np.sqrt(item.covariance[0, 0] * fitted.variance_factor) < item.cause.known_within)
 
 
 def confounded_with(item: Accepted, at: Tangents) -> str:

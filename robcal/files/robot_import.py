@@ -14,11 +14,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from pipeline.files import read_bytes
-from pipeline.robot_file import read_robot
-from pipeline.tables import read_table
-from pipeline.yaml_io import read_yaml
 from robcal.errors import InvalidInput
+from robcal.files.robot_file import read_robot
+from robcal.files.storage import read_bytes
+from robcal.files.tables import read_table
+from robcal.files.yaml_io import read_yaml
 from robcal.robot.dh import DHRow, frames_from_dh
 from robcal.robot.model import RobotModel
 from robcal.robot.urdf import model_from_steps, model_from_urdf

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.schemas import proposal, shown
-from pipeline.tables import Table, read_table
 from robcal.calibration.joint_log import JointLog, approach_from_order
 from robcal.errors import InvalidInput
+from robcal.files.schemas import proposal, shown
+from robcal.files.tables import Table, read_table
 from robcal.robot.model import RobotModel
 from robcal.transforms import Array
 

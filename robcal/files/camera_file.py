@@ -9,12 +9,12 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field
 
-from pipeline.camera_import import foreign_camera, split_choice
-from pipeline.files import write_text
-from pipeline.robot_file import Placement, placement_data
-from pipeline.schemas import Entry, Number, Positive, read_entry, shown
-from pipeline.yaml_io import FlowMapping, yaml_text
 from robcal.errors import InvalidInput
+from robcal.files.camera_import import foreign_camera, split_choice
+from robcal.files.robot_file import Placement, placement_data
+from robcal.files.schemas import Entry, Number, Positive, read_entry, shown
+from robcal.files.storage import write_text
+from robcal.files.yaml_io import FlowMapping, yaml_text
 from robcal.photogrammetry.core.camera import INTRINSIC_NAMES, Camera
 from robcal.transforms import Array
 

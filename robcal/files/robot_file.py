@@ -13,10 +13,10 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BeforeValidator, Field
 
-from pipeline.files import write_text
-from pipeline.schemas import Entry, NotNegative, Number, Text, Triple, proposal, read_entry
-from pipeline.yaml_io import FlowMapping, YamlDocument, yaml_text
 from robcal.errors import InvalidInput
+from robcal.files.schemas import Entry, NotNegative, Number, Text, Triple, proposal, read_entry
+from robcal.files.storage import write_text
+from robcal.files.yaml_io import FlowMapping, YamlDocument, yaml_text
 from robcal.robot.model import RESERVED_FRAME_NAMES, Frame, Payload, RobotModel, Term
 from robcal.transforms import Array, frame_from_xyzrpy, xyzrpy_from_frame
 

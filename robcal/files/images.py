@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.files import read_bytes
-from pipeline.tiff import MAGIC, plain_tiff
 from robcal.errors import InvalidInput
+from robcal.files.storage import read_bytes
+from robcal.files.tiff import MAGIC, plain_tiff
 
 SUFFIXES = frozenset({".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp"})
 MAX_BYTES = 1_500_000_000

@@ -17,9 +17,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.files import read_bytes, write_text
-from pipeline.schemas import proposal, shown
 from robcal.errors import InvalidInput
+from robcal.files.schemas import proposal, shown
+from robcal.files.storage import read_bytes, write_text
 from robcal.transforms import Array
 
 MAX_BYTES = 400_000_000

@@ -13,10 +13,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.frame_tables import SIX, frame_covariance_columns, twist_covariance
-from pipeline.tables import Table, read_table
 from robcal.calibration.slips import empty_readings, frozen_readings
 from robcal.errors import InvalidInput
+from robcal.files.frame_tables import SIX, frame_covariance_columns, twist_covariance
+from robcal.files.tables import Table, read_table
 from robcal.transforms import Array, frame_from_xyzrpy
 
 IntArray = NDArray[np.int64]

@@ -16,9 +16,9 @@ from xml.etree import ElementTree
 import cv2
 import numpy as np
 
-from pipeline.files import read_bytes
-from pipeline.yaml_io import read_yaml
 from robcal.errors import InvalidInput
+from robcal.files.storage import read_bytes
+from robcal.files.yaml_io import read_yaml
 from robcal.photogrammetry.core.camera import Camera
 from robcal.transforms import Array
 

@@ -13,8 +13,8 @@ from typing import Annotated, Any, TypeVar
 from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError, model_validator
 from pydantic_core import PydanticCustomError
 
-from pipeline.yaml_io import YamlDocument, read_yaml
 from robcal.errors import InvalidInput
+from robcal.files.yaml_io import YamlDocument, read_yaml
 
 MAX_TEXT = 1000
 """Characters of a name or path; longer ones are no names."""

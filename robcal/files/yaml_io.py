@@ -14,8 +14,8 @@ from typing import Any
 
 import yaml
 
-from pipeline.files import read_bytes
 from robcal.errors import InvalidInput
+from robcal.files.storage import read_bytes
 
 MAX_BYTES = 20_000_000
 MAX_NODES = 2_000_000
