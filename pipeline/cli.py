@@ -211,13 +211,6 @@ def compensate(
         )
         for sentence in answer["warnings"]:
             LOG.warning(sentence)
-        if program == "rapid" and targets:
-            LOG.warning(f"{out}: the tool data 'tool_robcal' hold the body's frame and 1 kg: put in the load")
-        if program and targets and not in_base:
-            LOG.warning(
-                f"{out}: its targets are in the measuring system's coordinates, not in the robot's base; "
-                "controllers want --in base"
-            )
         remaining = answer["remaining_max_mm"]
         told = f"at most {remaining:.2g} mm" if remaining >= 1e-4 else "below 0.0001 mm"
         LOG.info(f"{answer['frames']} rows in {out}, remaining error {told}")

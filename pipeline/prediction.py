@@ -18,7 +18,7 @@ from robcal.files.storage import write_text
 from robcal.files.tables import read_table, write_table
 from robcal.robot.compensation import cell_frames, compensate
 from robcal.robot.export.controller_formats import frame_program, joint_program, program_name
-from robcal.transforms import Array, frame_from_xyzrpy
+from robcal.transforms import Array, frame_from_xyzrpy, invert
 
 
 def predict_run(folder: Path, poses: Path, out: Path, *, nominal: bool = False) -> dict[str, Any]:
@@ -114,10 +114,17 @@ def compensate_run(
     if program is not None:
         name, q = program_name(out.stem), result.q[rows]
         if as_frames:
-            tool = cell_frames(calibrated.kernel)[1]
-            text = frame_program(result.F_star[rows], program, name, tool, model=model, q=q)
-            load = "has a load of 1 kg" if program == "rapid" else "is set without its load"
-            warnings.append(f"{out}: the calibrated tool {load}: give the controller the real load data")
+            # the program makes the robot's base the active one, whatever the wanted frames were given in
+            world_T_base, tool = cell_frames(calibrated.kernel)
+            targets = result.F_star[rows] if in_base else invert(world_T_base) @ result.F_star[rows]
+            text = frame_program(targets, program, name, tool, model=model, q=q)
+            load = "the tool data 'tool_robcal' hold 1 kg" if program == "rapid" else "the tool is set without its load"
+            warnings.append(f"{out}: {load}: give the controller the real load data")
+            if not in_base:
+                warnings.append(
+                    f"{frames}: read in the measuring system's coordinates, not in the robot's base (--in base); the "
+                    "program's targets are converted to base coordinates"
+                )
         else:
             text = joint_program(model, q, program, name)
         write_text(out, text)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robcal.imaging.blobs import Candidates
-from robcal.imaging.edge_model import axes_from_matrix, matrix_from_axes, signed_distance
+from robcal.imaging.edge_model import axes_from_matrix, matrix_from_axes
 from robcal.imaging.ellipse_fit import EllipseFits, iterate, outliers, start
 from robcal.imaging.image_statistics import noise_around, noise_correlation, noise_inside, shading_priors, without_doubt
 from robcal.imaging.noise import NoiseModel
@@ -28,12 +28,6 @@ _FLOOR_EDGE, _FLOOR_SPOT = 0.001, 0.006
 _GLARE_MAX = 0.015  # of the dot's contrast: light of a ring that is taken off; pixels with more are left out
 _PIXELS_MIN = 12  # pixels with information that a fit of twelve parameters needs at least
 _SPOT_RATIO, _SPOT_RATIO_ROUND = 1.7, 1.2  # minor semi-axis by s below which a tilted, a round dot is a spot
-
-
-# grey values beside a dot that are no plane (the rim of a post, an edge of the plate) pull its centre
-_UNEVEN_CHI2 = 2.0  # mean squared normalised residual of the ground beyond which it is no plane
-_UNEVEN_SHARE = 0.004  # of the contrast: RMS of the background's residuals below which it does no harm
-_UNEVEN_SHADING = 0.3  # prior sigma of the gain gradient where the slope of the background is not that of the dot
 
 
 @dataclass(frozen=True)
@@ -100,18 +94,14 @@ def fit_dots(
     max_misfit : fits with three times this misfit (by contrast) after the first round are given up.
     """
     groups, fits = _first_round(image, candidates, noise, saturation, max_misfit)
-    uneven = [_on_uneven_ground(fit, window) for window, fit in zip(groups, fits, strict=True)]
-    groups = [_near_the_dot(window, fit, rows) for window, fit, rows in zip(groups, fits, uneven, strict=True)]
     clean = [without_doubt(window, fit) for window, fit in zip(groups, fits, strict=True)]
     noise = noise_inside(groups, fits, clean, noise_around(groups, fits, clean, noise))
     fits = [iterate(fit, window, noise, 2, tolerance=0.05) for window, fit in zip(groups, fits, strict=True)]
     shading, prior = shading_priors(groups, fits)
     noise = replace(noise, correlation=noise_correlation(groups, fits, clean))
     results = []
-    for window, fit, rows in zip(groups, fits, uneven, strict=True):
-        sigma = np.where(rows, np.maximum(shading[window.index], _UNEVEN_SHADING), shading[window.index])
-        # a ringed dot is fitted again without its ring, under the prior of the image
-        results.append(_finish(fit, window, noise, sigma, candidates) | {"shading_sigma": shading[window.index]})
+    for window, fit in zip(groups, fits, strict=True):
+        results.append(_finish(fit, window, noise, shading[window.index], candidates))
     return _join(results, groups), noise, prior
 
 
@@ -204,33 +194,6 @@ def _finish(fit: EllipseFits, window: Windows, noise: NoiseModel, shading: Array
     if tiny.any():
         fit = _as_spots(fit, window, noise, np.flatnonzero(tiny), prior_blur, dropped)
     return _columns(fit, window, noise)
-
-
-def _edge_distance(fit: EllipseFits, window: Windows) -> Array:
-    """Signed distance (n, p) of the pixels to the edge of the fitted ellipse in units of its blur."""
-    return signed_distance(fit.parameters, window.x, window.y) * np.exp(-fit.parameters[:, 5, None])
-
-
-def _on_uneven_ground(fit: EllipseFits, window: Windows) -> NDArray[np.bool_]:
-    """(n,) dots whose surroundings are no plane, beyond the noise of the image."""
-    ground = (fit.weight > 0) & (_edge_distance(fit, window) > 0.5)
-    count = np.maximum(ground.sum(axis=1), 1)
-    square = np.where(ground, fit.residual**2, 0.0)
-    chi2 = (fit.weight * square).sum(axis=1) / count
-    share = np.sqrt(square.sum(axis=1) / count) / np.maximum(np.abs(fit.parameters[:, 9]), 1e-6)
-    return np.asarray((chi2 > _UNEVEN_CHI2) & (share > _UNEVEN_SHARE))
-
-
-def _near_the_dot(window: Windows, fit: EllipseFits, uneven: NDArray[np.bool_]) -> Windows:
-    """Windows that end one blur beyond the dots `uneven`.
-
-    What an edge near by adds to the dot's own edge is then, to first order, a level and a slope of the background,
-    which the fit has; as the slope does not go on inside the dot the gain gradient is set free. A rim of 10 to 20 % of
-    the contrast at 1.2 to 2 radii moved centres by 0.02 to 0.08 px; so it moves them by 0.01 px at most.
-    """
-    if not uneven.any():
-        return window
-    return replace(window, valid=window.valid & ~(uneven[:, None] & (_edge_distance(fit, window) > 1.0)))
 
 
 def _as_spots(

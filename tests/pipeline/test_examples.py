@@ -21,7 +21,7 @@ def files(folder: str) -> list[Path]:
 @pytest.mark.parametrize("path", files("campaigns"), ids=lambda p: p.stem)
 def test_campaigns(path: Path) -> None:
     entry = parse(read_yaml(path), CampaignEntry, FORMAT)
-    named = [entry.robot, *(use.targets for use in entry.bodies.values())]
+    named = [entry.robot.file if entry.robot else None, *(use.targets for use in entry.bodies.values())]
     if entry.station is not None:
         assert entry.station.body in entry.bodies
         named += [camera.calibration for camera in entry.station.cameras.values()]

@@ -19,8 +19,11 @@ from pipeline.exports import export_run
 from pipeline.prediction import compensate_run, predict_run
 from pipeline.runner import run_campaign
 from pipeline.runs import open_run
+from pipeline.stages.identify import load_calibrated
 from robcal.errors import InvalidInput
 from robcal.files.tables import read_table
+from robcal.robot.chain import chain_of, forward
+from robcal.robot.compensation import cell_frames
 from robcal.robot.model import Term
 from tests.pipeline.conftest import edit_yaml
 
@@ -102,3 +105,21 @@ def test_an_unknown_controller_is_refused(finished: tuple[Path, Path], tmp_path:
     predict_run(run, campaign / "poses.csv", tmp_path / "wanted.csv")
     with pytest.raises(InvalidInput, match="krl, rapid or urscript"):
         compensate_run(run, tmp_path / "wanted.csv", tmp_path / "o", program="karel")
+
+
+def test_targets_of_programs_are_base_coordinates_whatever_the_frames_were_given_in(
+    finished: tuple[Path, Path], tmp_path: Path
+) -> None:
+    """The commanded joint values and the Cartesian targets of a program mean the same place for the controller."""
+    campaign, run = finished
+    predict_run(run, campaign / "poses.csv", tmp_path / "wanted.csv")
+    compensate_run(run, tmp_path / "wanted.csv", tmp_path / "q.csv")
+    out = tmp_path / "part.script"
+    compensate_run(run, tmp_path / "wanted.csv", out, as_frames=True, program="urscript")
+    robot = load_calibrated(open_run(run))
+    table = read_table(tmp_path / "q.csv")
+    q = np.radians(np.column_stack([table.numbers(f"q{k}_deg") for k in range(1, 7)]))
+    believed = forward(chain_of(robot.model), q) @ cell_frames(robot.kernel)[1]
+    poses = [line for line in out.read_text().splitlines() if "movej(p[" in line]
+    places = np.array([[float(v) for v in line.split("p[")[1].split("]")[0].split(",")][:3] for line in poses])
+    assert places == pytest.approx(believed[1:, :3, 3], abs=1e-6)

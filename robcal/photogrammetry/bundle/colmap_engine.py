@@ -19,10 +19,10 @@ import pycolmap
 
 from robcal.errors import InvalidInput
 from robcal.estimation.summary import SolveSummary
-from robcal.photogrammetry.bundle.body_frame import fit_similarity
+from robcal.photogrammetry.bundle.body_frame import Similarity, fit_similarity
 from robcal.photogrammetry.bundle.datum import Datum
 from robcal.photogrammetry.bundle.determinacy import intrinsics_basis
-from robcal.photogrammetry.bundle.lengths import rows_of
+from robcal.photogrammetry.bundle.lengths import distances, rows_of
 from robcal.photogrammetry.bundle.operator import problem_of
 from robcal.photogrammetry.bundle.result import NetworkContext, finish
 from robcal.photogrammetry.bundle.solver import Bars
@@ -113,46 +113,19 @@ def adjust_with_colmap(
     if not set(_FREE) <= set(network.free_intrinsics):
         held = sorted(set(_FREE) - set(network.free_intrinsics))
         raise InvalidInput(f"engine pycolmap cannot hold {', '.join(held)} alone: use engine robcal for this survey")
-    c = network.camera
-    f = 0.5 * (c.fx + c.fy)
-    start = Camera(c.width, c.height, f, f, (c.width - 1) / 2, (c.height - 1) / 2)
     problem, state = problem_of(network, lengths)
     # COLMAP knows points only: it gets the images of the centres, where the ellipses of large dots lie elsewhere
     shift = np.empty((len(network.marks), 2))
     shift[problem.order.order] = problem.shift(state)
-    marks = replace(network.marks, xy=network.marks.xy - shift)
-    model = to_reconstruction(start, network.camera_T_body, network.points, marks, network.image_names, with_k3=False)
-    options = pycolmap.BundleAdjustmentOptions()
-    options.refine_principal_point = True
-    options.print_summary = False
-    options.ceres.solver_options.function_tolerance = 1e-12
-    options.ceres.solver_options.gradient_tolerance = 1e-10
-    options.ceres.solver_options.max_num_iterations = 200
-    with _quiet():
-        pycolmap.bundle_adjustment(model, options)
-    values = np.array(model.cameras[1].params)
-    camera = Camera(c.width, c.height, *values[:2], *(values[2:4] - 0.5), *values[4:8])
-    n, t = len(network.image_names), len(network.ids)
-    poses = np.tile(np.eye(4), (n, 1, 1))
-    for j in range(n):
-        poses[j, :3] = model.images[j + 1].cam_from_world().matrix()
-    points = np.array([model.points3D[i + 1].xyz for i in range(t)])
-    if not np.all(np.isfinite(points)) or not np.all(np.isfinite(values)):
-        raise InvalidInput("engine pycolmap did not converge on this network: use engine robcal")
-    frame = fit_similarity(network.points, points, with_scale=True)
+    camera, poses, points = _minimised(network, replace(network.marks, xy=network.marks.xy - shift))
+    frame = _frame_of(network, points, lengths)
     rows = rows_of(lengths, network.ids)
-    if len(lengths):
-        measured = np.linalg.norm(points[rows[:, 0]] - points[rows[:, 1]], axis=1)
-        w = 1.0 / lengths.sigma**2
-        scale = float(np.sum(w * measured * lengths.length) / np.sum(w * measured**2))
-        frame = fit_similarity(network.points, scale * points, with_scale=False)
-        frame = replace(frame, scale=scale)
     free = tuple(name for name in network.free_intrinsics if name != "k3")
     problem = replace(
         problem,
         basis=intrinsics_basis(free),
         bars=Bars(rows, lengths.length, lengths.sigma),
-        datum=Datum("inner", np.arange(t), len(lengths) == 0, network.datum),
+        datum=Datum("inner", np.arange(len(network.ids)), len(lengths) == 0, network.datum),
     )
     state = replace(state, camera=camera, camera_T_body=frame.stations(poses), points=frame.points(points))
     note = "engine pycolmap: marks weighted alike, k3 = 0, scale bars used for the scale only"
@@ -168,3 +141,38 @@ def adjust_with_colmap(
     )
     summary = SolveSummary(True, 0, "by COLMAP", network.summary.cost_start, network.summary.cost)
     return finish(problem, state, summary, context, variance_components=True, iterate=False)
+
+
+def _minimised(network: CameraNetwork, marks: ImageMarks) -> tuple[Camera, Array, Array]:
+    """Camera, stations (n, 4, 4) and points (t, 3) at COLMAP's minimum, in its own scale and frame."""
+    c = network.camera
+    f = 0.5 * (c.fx + c.fy)
+    start = Camera(c.width, c.height, f, f, (c.width - 1) / 2, (c.height - 1) / 2)
+    model = to_reconstruction(start, network.camera_T_body, network.points, marks, network.image_names, with_k3=False)
+    options = pycolmap.BundleAdjustmentOptions()
+    options.refine_principal_point = True
+    options.print_summary = False
+    options.ceres.solver_options.function_tolerance = 1e-12
+    options.ceres.solver_options.gradient_tolerance = 1e-10
+    options.ceres.solver_options.max_num_iterations = 200
+    with _quiet():
+        pycolmap.bundle_adjustment(model, options)
+    values = np.array(model.cameras[1].params)
+    poses = np.tile(np.eye(4), (len(network.image_names), 1, 1))
+    for j in range(len(poses)):
+        poses[j, :3] = model.images[j + 1].cam_from_world().matrix()
+    points = np.array([model.points3D[i + 1].xyz for i in range(len(network.ids))])
+    if not np.all(np.isfinite(points)) or not np.all(np.isfinite(values)):
+        raise InvalidInput("engine pycolmap did not converge on this network: use engine robcal")
+    camera = Camera(c.width, c.height, *values[:2], *(values[2:4] - 0.5), *values[4:8])
+    return camera, poses, points
+
+
+def _frame_of(network: CameraNetwork, points: Array, lengths: Lengths) -> Similarity:
+    """Transformation of COLMAP's points (t, 3) onto the network's, its scale from the scale bars if there are any."""
+    if len(lengths) == 0:
+        return fit_similarity(network.points, points, with_scale=True)
+    measured, _ = distances(points, rows_of(lengths, network.ids))
+    w = 1.0 / lengths.sigma**2
+    scale = float(np.sum(w * measured * lengths.length) / np.sum(w * measured**2))
+    return replace(fit_similarity(network.points, scale * points, with_scale=False), scale=scale)

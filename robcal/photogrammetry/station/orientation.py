@@ -227,28 +227,13 @@ def _result(
     rejected: tuple[RejectedMark, ...],
 ) -> StationOrientation:
     marks, design, x = state.marks, adjusted.design, state.unknowns
-    e, c, t = len(state.exterior_camera), len(state.names), len(state.body)
+    e, c = len(state.exterior_camera), len(state.names)
     Qpp, R = covariance_blocks(design, marks, e, c)
     diagonal = np.einsum("mii->mi", R)
     total = float(diagonal.sum())
     raw = design.residual * state.noise[marks.camera][:, None]
     sigma0 = float(np.sqrt(np.sum(raw**2) / total)) if total > 0 else float("nan")
     pixels = np.einsum("mij,mj->mi", np.linalg.inv(design.whitening), design.residual)
-    # exterior and interior covariance, the interior in its nine parameters
-    station = slice(0, 6 * e + 9 * c)
-    to_numbers = np.eye(6 * e + 9 * c)
-    basis = interior_basis(x.interior)
-    for i in range(c):
-        at = slice(6 * e + 9 * i, 6 * e + 9 * i + 9)
-        to_numbers[at, at] = basis[i]
-    covariance = to_numbers @ design.reduced_inverse[station, station] @ to_numbers.T
-    seen = np.unique(marks.target)
-    points = np.where(np.isin(np.arange(t), seen)[:, None], x.points, state.body.points)
-    C = design.reduced_inverse[-3 * t :, -3 * t :].copy()
-    rest = np.setdiff1d(np.arange(t), seen)
-    if state.body.covariance is not None and len(rest):
-        unseen = (3 * rest[:, None] + np.arange(3)).ravel()
-        C[np.ix_(unseen, unseen)] = state.body.covariance[np.ix_(unseen, unseen)]
     cameras_of_pose = np.zeros((len(state.poses), c), dtype=bool)
     cameras_of_pose[marks.pose, marks.camera] = True
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -259,13 +244,13 @@ def _result(
         exterior_camera=state.exterior_camera,
         exterior_first_pose=state.exterior_first,
         world_T_exterior=x.world_T_exterior,
-        covariance=covariance,
+        covariance=_station_covariance(state, adjusted),
         poses=state.poses,
         world_T_body=x.world_T_body,
         body_covariance=Qpp,
         pose_cameras=cameras_of_pose.sum(axis=1),
         ambiguous_poses=ambiguous,
-        body=replace(state.body, points=points, covariance=C),
+        body=_adjusted_body(state, adjusted),
         marks=marks,
         design=design,
         redundancy=diagonal,
@@ -280,3 +265,26 @@ def _result(
         converged=adjusted.summary.converged,
         iterations=adjusted.summary.iterations,
     )
+
+
+def _station_covariance(state: StationState, adjusted: Adjusted) -> Array:
+    """Covariance of exterior and interior orientations, the interior in its nine parameters."""
+    e, c = len(state.exterior_camera), len(state.names)
+    size = 6 * e + 9 * c
+    to_parameters = np.eye(size)
+    for i, basis in enumerate(interior_basis(state.unknowns.interior)):
+        at = slice(6 * e + 9 * i, 6 * e + 9 * i + 9)
+        to_parameters[at, at] = basis
+    return to_parameters @ adjusted.design.reduced_inverse[:size, :size] @ to_parameters.T
+
+
+def _adjusted_body(state: StationState, adjusted: Adjusted) -> Body:
+    """The body with adjusted coordinates; targets that no image shows keep their given ones and their covariance."""
+    t = len(state.body)
+    seen = np.isin(np.arange(t), state.marks.target)
+    C = adjusted.design.reduced_inverse[-3 * t :, -3 * t :].copy()
+    if state.body.covariance is not None and not seen.all():
+        unseen = (3 * np.flatnonzero(~seen)[:, None] + np.arange(3)).ravel()
+        C[np.ix_(unseen, unseen)] = state.body.covariance[np.ix_(unseen, unseen)]
+    points = np.where(seen[:, None], state.unknowns.points, state.body.points)
+    return replace(state.body, points=points, covariance=C)
