@@ -19,6 +19,7 @@ T = TypeVar("T")
 LOG = logging.getLogger("pipeline")
 LOG.setLevel(logging.DEBUG)
 LOG.addHandler(logging.NullHandler())
+LOG.propagate = False  # names of files that are no Unicode: only handlers that escape them may write
 _TERMINAL = "terminal"
 
 

@@ -8,7 +8,7 @@ import pytest
 from fixtures.campaigns import make_campaign
 from pipeline.prediction import predict_run
 from pipeline.runner import run_campaign
-from pipeline.tables import read_table
+from robcal.files.tables import read_table
 
 
 @pytest.mark.parametrize("level", ["frames", "points"])
