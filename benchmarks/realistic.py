@@ -12,6 +12,7 @@ and not run again; ``--keep`` keeps campaigns, runs and predictions, one folder 
 from __future__ import annotations
 
 import argparse
+import csv
 import json
 import os
 import subprocess
@@ -25,7 +26,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import yaml
 
 from benchmarks.impossible_causes import impossible
@@ -51,6 +51,7 @@ def pipeline(*arguments: str | Path) -> tuple[int, str]:
 
 
 _HERE = Path(__file__).resolve().parent.parent
+_COLUMNS = (("x_mm", "y_mm", "z_mm"), ("sx_mm", "sy_mm", "sz_mm"))
 
 
 @dataclass(frozen=True)
@@ -71,15 +72,20 @@ class Predicted:
         return float(np.mean(np.abs(self.error) < 1.959964 * self.sigma))
 
 
+def table_rows(path: Path) -> list[dict[str, str]]:
+    """Rows of a table by the names of its columns."""
+    with path.open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
 def predicted(run: Path, second: Path, truth: Array) -> Predicted | None:
     """What ``pipeline predict`` says of the second recording against the truth (n, 3), mm; None if it says nothing."""
     out = run.parent / f"{run.name}.csv"
     if pipeline("predict", run, "--poses", second, "--out", out)[0]:
         return None
-    table = pd.read_csv(out)
-    sigma = [f"s{a}_mm" for a in "xyz"]
-    known = table[sigma].to_numpy() if set(sigma) <= set(table) else np.full((len(table), 3), np.nan)
-    return Predicted(table[["x_mm", "y_mm", "z_mm"]].to_numpy() - truth, known)
+    rows = table_rows(out)
+    position, sigma = (np.array([[float(r.get(k, "nan")) for k in keys] for r in rows]) for keys in _COLUMNS)
+    return Predicted(position - truth, sigma)
 
 
 def run_one(seed: int, most_poses: int, keep: Path | None) -> Record:
