@@ -5,20 +5,15 @@ Exit codes: 0 done, 1 the data cannot give a result, 2 wrong use.
 
 from __future__ import annotations
 
-import json
 import sys
-import tempfile
-import traceback
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from pipeline.json_io import plain
-from pipeline.messages import LOG, show
-from robcal.errors import RobcalError
+from pipeline.answers import Json, Quiet, answers, wrong_use
+from pipeline.drift_commands import app as drift_app
+from pipeline.messages import LOG
 
 app = typer.Typer(
     name="pipeline",
@@ -29,49 +24,13 @@ app = typer.Typer(
     help="From photographs to an accurate robot: survey, measurement, identification, diagnosis, compensation.",
 )
 
-Quiet = Annotated[bool, typer.Option("-q", "--quiet", help="Only warnings and errors on standard error.")]
-Json = Annotated[bool, typer.Option("--json", help="One result line for programs on standard output.")]
 Workers = Annotated[int | None, typer.Option("--workers", min=1, max=1024, help="Processes for work on images.")]
 RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder of a finished campaign.")]
+RunOrDrift = Annotated[
+    Path, typer.Argument(metavar="RUN", help="Run folder of a finished campaign, or state of a drift control.")
+]
+AtCycle = Annotated[int | None, typer.Option("--at-cycle", help="Of a drift control: the model of an earlier cycle.")]
 CampaignPath = Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="Campaign folder, or its YAML file.")]
-
-
-@contextmanager
-def _answers(command: str, as_json: bool, quiet: bool) -> Iterator[dict[str, Any]]:
-    """Run a command's body; errors on purpose become one line and exit code 1, a mistake of the program too."""
-    answer: dict[str, Any] = {}
-    show(quiet)
-    try:
-        yield answer
-    except typer.Exit:
-        raise
-    except RobcalError as error:
-        _fail(command, as_json, " ".join(str(error).split()))
-    except OSError as error:
-        where = f"{error.filename}: " if error.filename else ""
-        _fail(command, as_json, f"{where}{error.strerror or error}")
-    except MemoryError:
-        _fail(command, as_json, "not enough memory: use smaller images or fewer at once")
-    except Exception as error:
-        with tempfile.NamedTemporaryFile(
-            "w", prefix="robcal-", suffix=".log", delete=False, encoding="utf-8", errors="backslashreplace"
-        ) as stream:
-            stream.write(traceback.format_exc())
-        _fail(command, as_json, f"internal error ({type(error).__name__}): the traceback is in {stream.name}")
-    if as_json:
-        typer.echo(json.dumps(plain({"ok": True, "command": command, **answer})))
-
-
-def _fail(command: str, as_json: bool, sentence: str) -> None:
-    typer.echo(f"error: {sentence}", err=True)
-    if as_json:
-        typer.echo(json.dumps({"ok": False, "command": command, "error": sentence}))
-    raise typer.Exit(1)
-
-
-def _wrong_use(sentence: str) -> None:
-    typer.echo(f"wrong use: {sentence}", err=True)
-    raise typer.Exit(2)
 
 
 def _check_stages(start: str | None, until: str | None) -> None:
@@ -80,9 +39,9 @@ def _check_stages(start: str | None, until: str | None) -> None:
 
     for name in (until, start):
         if name is not None and name not in STAGE_NAMES:
-            _wrong_use(f"there is no stage '{name}'{proposal(name, list(STAGE_NAMES))}")
+            wrong_use(f"there is no stage '{name}'{proposal(name, list(STAGE_NAMES))}")
     if start and until and STAGE_NAMES.index(until) < STAGE_NAMES.index(start):
-        _wrong_use(f"stage '{until}' comes before '{start}': --until must not lie before --from")
+        wrong_use(f"stage '{until}' comes before '{start}': --until must not lie before --from")
 
 
 def _summary(done: Any) -> dict[str, Any]:
@@ -106,7 +65,7 @@ def run(
 
     Stages: detect, survey, orient, measure, frames, identify, diagnose, verify, report.
     """
-    with _answers("run", as_json, quiet) as answer:
+    with answers("run", as_json, quiet) as answer:
         _check_stages(start, until)
         from pipeline.runner import run_campaign
 
@@ -125,7 +84,7 @@ def survey(
     as_json: Json = False,
 ) -> None:
     """Only the bundle adjustment of the campaign's bodies."""
-    with _answers("survey", as_json, quiet) as answer:
+    with answers("survey", as_json, quiet) as answer:
         from pipeline.commands import survey_campaign
 
         done = survey_campaign(campaign, body, out, workers)
@@ -142,7 +101,7 @@ def diagnose(
     as_json: Json = False,
 ) -> None:
     """Say what physics the model lacks: only the diagnosis (also a stage of `run`)."""
-    with _answers("diagnose", as_json, quiet) as answer:
+    with answers("diagnose", as_json, quiet) as answer:
         from pipeline.commands import diagnose_place
 
         done, diagnosis = diagnose_place(place, out, workers)
@@ -155,20 +114,21 @@ def diagnose(
 
 @app.command(short_help="Where the calibrated robot's tool really is.")
 def predict(
-    run_folder: RunFolder,
+    run_folder: RunOrDrift,
     poses: Annotated[Path, typer.Option("--poses", help="Joint angles: pose, q1_deg, ... as in poses.csv.")],
     out: Annotated[Path, typer.Option("--out", help="Table of frames to write.")],
     nominal: Annotated[
         bool, typer.Option("--nominal", help="The uncalibrated robot after the best cell calibration.")
     ] = False,
+    at_cycle: AtCycle = None,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
     """Say where the calibrated robot's tool really is, in the measuring system's coordinates."""
-    with _answers("predict", as_json, quiet) as answer:
+    with answers("predict", as_json, quiet) as answer:
         from pipeline.prediction import predict_run
 
-        answer.update(predict_run(run_folder, poses, out, nominal=nominal))
+        answer.update(predict_run(run_folder, poses, out, nominal=nominal, at_cycle=at_cycle))
         for sentence in answer["warnings"]:
             LOG.warning(sentence)
         LOG.info(f"{answer['poses']} frames in {out}")
@@ -176,7 +136,7 @@ def predict(
 
 @app.command(short_help="Commands that bring the tool where it should be.")
 def compensate(
-    run_folder: RunFolder,
+    run_folder: RunOrDrift,
     frames: Annotated[Path, typer.Option("--frames", help="Wanted tool frames; column payload if loads differ.")],
     out: Annotated[Path, typer.Option("--out", help="Table of joint angles (or targets) to write.")],
     kind: Annotated[str, typer.Option("--as", metavar="joints|frames", help="Joint angles, or targets F*.")] = "joints",
@@ -190,23 +150,31 @@ def compensate(
     skip: Annotated[
         bool, typer.Option("--skip-unreachable", help="Leave out frames that the robot cannot reach.")
     ] = False,
+    at_cycle: AtCycle = None,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
     """Find the commands that bring the real tool to the wanted frames."""
     if kind not in ("joints", "frames"):
-        _wrong_use(f"--as is 'joints' or 'frames', not '{kind}'")
+        wrong_use(f"--as is 'joints' or 'frames', not '{kind}'")
     if system not in ("world", "base"):
-        _wrong_use(f"--in is 'world' or 'base', not '{system}'")
+        wrong_use(f"--in is 'world' or 'base', not '{system}'")
     if program not in (None, "krl", "rapid", "urscript"):
-        _wrong_use(f"--program is 'krl', 'rapid' or 'urscript', not '{program}'")
-    with _answers("compensate", as_json, quiet) as answer:
+        wrong_use(f"--program is 'krl', 'rapid' or 'urscript', not '{program}'")
+    with answers("compensate", as_json, quiet) as answer:
         from pipeline.prediction import compensate_run
 
         targets, in_base = kind == "frames", system == "base"
         answer.update(
             compensate_run(
-                run_folder, frames, out, as_frames=targets, in_base=in_base, skip_unreachable=skip, program=program
+                run_folder,
+                frames,
+                out,
+                as_frames=targets,
+                in_base=in_base,
+                skip_unreachable=skip,
+                program=program,
+                at_cycle=at_cycle,
             )
         )
         for sentence in answer["warnings"]:
@@ -219,7 +187,7 @@ def compensate(
 @app.command()
 def report(run_folder: RunFolder, quiet: Quiet = False, as_json: Json = False) -> None:
     """Write the report again."""
-    with _answers("report", as_json, quiet) as answer:
+    with answers("report", as_json, quiet) as answer:
         from pipeline.commands import report_again
 
         path = report_again(run_folder)
@@ -235,7 +203,7 @@ def demo(
     as_json: Json = False,
 ) -> None:
     """Render a small campaign and run it; the last line is the path of the report."""
-    with _answers("demo", as_json, quiet) as answer:
+    with answers("demo", as_json, quiet) as answer:
         from pipeline.commands import run_demo
 
         done = run_demo(out, workers)
@@ -252,7 +220,7 @@ def poses(
     as_json: Json = False,
 ) -> None:
     """Generate measuring poses: within limits, visible, free of collisions, as few as the wanted accuracy needs."""
-    with _answers("poses", as_json, quiet) as answer:
+    with answers("poses", as_json, quiet) as answer:
         from pipeline.pose_generation import generate_poses
 
         answer.update(generate_poses(config, out))
@@ -263,22 +231,26 @@ def poses(
 
 @app.command(short_help="C99 and URDF of the calibrated robot.")
 def export(
-    run_folder: RunFolder,
+    run_folder: RunOrDrift,
     c: Annotated[Path | None, typer.Option("--c", help="Folder for C99 source of the model and its inverse.")] = None,
     urdf: Annotated[Path | None, typer.Option("--urdf", help="URDF file of the calibrated robot.")] = None,
+    at_cycle: AtCycle = None,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
     """Export the calibrated robot for controllers and simulators."""
     if c is None and urdf is None:
-        _wrong_use("name what to write: --c FOLDER, --urdf FILE, or both")
-    with _answers("export", as_json, quiet) as answer:
+        wrong_use("name what to write: --c FOLDER, --urdf FILE, or both")
+    with answers("export", as_json, quiet) as answer:
         from pipeline.exports import export_run
 
-        written = export_run(run_folder, c, urdf)
+        written = export_run(run_folder, c, urdf, at_cycle)
         answer["files"] = [str(path) for path in written]
         for path in written:
             LOG.info(str(path))
+
+
+app.add_typer(drift_app, name="drift")
 
 
 def main() -> None:
