@@ -3,8 +3,6 @@
 Exit codes: 0 done, 1 the data cannot give a result, 2 wrong use.
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from typing import Annotated, Any
