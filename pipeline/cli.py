@@ -3,14 +3,13 @@
 Exit codes: 0 done, 1 the data cannot give a result, 2 wrong use.
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+from pipeline.cell_commands import cell
 from pipeline.command_line import CampaignPath, Json, Quiet, RunFolder, Workers, answers, wrong_use
 from pipeline.messages import LOG
 
@@ -22,6 +21,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="From photographs to an accurate robot: survey, measurement, identification, diagnosis, compensation.",
 )
+app.add_typer(cell, name="cell")
 
 
 def _check_stages(start: str | None, until: str | None) -> None:

@@ -1,7 +1,5 @@
 """What all commands share: options, one line for errors on purpose, exit codes, the line for programs."""
 
-from __future__ import annotations
-
 import json
 import tempfile
 import traceback
