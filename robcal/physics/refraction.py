@@ -18,8 +18,8 @@ REFRACTION = Kind(
 STEP = 1e-3
 """Metres over which the field is differentiated: it is a polynomial of the second degree, so any will do."""
 LARGEST = 3e-4
-"""1/m: lines of sight do not bend more. Air does by 1e-6 per kelvin and metre of its gradient (Ciddor, 1996); the rest is
-left to windows."""
+"""1/m: lines of sight do not bend more. Air does by 1e-6 per kelvin and metre of its gradient (Ciddor, 1996); the rest
+is left to windows."""
 
 
 def refraction_causes(data: ObservationData) -> Iterator[ObservationCause]:
