@@ -1,7 +1,5 @@
 """A cause: what makes measurements differ from what a model says, of a kind that has a name, at one place."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Stage diagnose: which physics the model leaves out; the extended model serves everything after it."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 from typing import Any

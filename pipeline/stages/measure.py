@@ -1,7 +1,5 @@
 """Stage measure: targets in the world, by forward intersection or from the tables of another system."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from pipeline.artifacts import POINTS

@@ -1,7 +1,5 @@
 """Stage verify: the calibrated robot on poses that took no part, and the files that hand it on."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

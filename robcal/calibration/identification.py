@@ -5,8 +5,6 @@ elimination of dependent parameters, choice of elasticities by evidence, outlier
 Source of the adjustment statistics: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, chapter 4.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,5 @@
 """A diagnosis as the content of diagnosis.json (`robcal/diagnosis-1`): plain numbers, millimetres and degrees."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -5,8 +5,6 @@ A problem is linearised at a state as whitened residuals ``r = measured - model`
 (an array, a frame, a network).
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from typing import TypeVar

@@ -1,7 +1,5 @@
 """When an iteration stops, and how it ended."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 

@@ -1,7 +1,5 @@
 """Sag of a robot whose masses nobody stated: compliance times unknown first moments, known functions of the angles."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

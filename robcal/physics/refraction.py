@@ -1,7 +1,5 @@
 """Bent lines of sight: what a temperature gradient, a window or water in front of an instrument does to points."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The robot in force on poses that took no part."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 

@@ -4,8 +4,6 @@ A name is taken only if what it leaves behind is clean or is another named cause
 explains the same recording better than the best name and the best pair of names, the cause is `unknown`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Measured points and poses of a body: the types between the station (or any other measuring system) and the robot."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -81,7 +79,9 @@ class MeasuredPoints:
             raise InvalidInput(f"target {target} is listed more than once in pose {pose}: keep one row")
 
     @classmethod
-    def from_table(cls, pose: Array, target: Array, p_world: Array, covariance: Array | None = None) -> MeasuredPoints:
+    def from_table(
+        cls, pose: Array, target: Array, p_world: Array, covariance: Array | None = None
+    ) -> "MeasuredPoints":
         """Points of any measuring system; ``covariance`` (m, 3, 3) m^2 or None."""
         m = len(pose)
         return cls(
