@@ -1,16 +1,14 @@
 """Targets that carry each other's number in some poses: found from lengths on the body, pose by pose."""
 
-from __future__ import annotations
-
 from collections import defaultdict
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
 
-from robcal.photogrammetry.core.bodies import Body
-from robcal.photogrammetry.measure.measured_points import MeasuredPoints
-from robcal.transforms import Array, IntArray
+from robcal.photogrammetry.core.bodies import Body, IntArray
+from robcal.photogrammetry.measure.measured_points import Exchange, MeasuredPoints
+from robcal.transforms import Array
 
 LEAST_DEVIATION = 1e-3
 """Metres: deviations of lengths below this are no matter of numbers."""
@@ -18,22 +16,6 @@ LEFT_OVER = 0.1
 """Share of the deviation that may remain once the numbers are exchanged."""
 FEWEST_TARGETS = 4
 """With three targets an exchange of two and one target off its place look alike."""
-
-
-@dataclass(frozen=True)
-class Exchange:
-    """Two targets that carry each other's number in some poses.
-
-    Attributes
-    ----------
-    targets : the two numbers, the smaller first. poses : numbers of the poses.
-    before, after : m, median deviation of the lengths to the other targets as recorded, and with the numbers exchanged.
-    """
-
-    targets: tuple[int, int]
-    poses: tuple[int, ...]
-    before: float
-    after: float
 
 
 def find_exchanges(points: MeasuredPoints, body: Body) -> tuple[Exchange, ...]:
@@ -67,13 +49,13 @@ def find_exchanges(points: MeasuredPoints, body: Body) -> tuple[Exchange, ...]:
 
 
 def exchanged_back(points: MeasuredPoints, exchanges: tuple[Exchange, ...]) -> MeasuredPoints:
-    """The points with the right numbers, in the order in which they were recorded."""
+    """The points with the right numbers, in the order in which they were recorded, and what was exchanged."""
     target: IntArray = points.target.copy()
     for exchange in exchanges:
         inside = np.isin(points.pose, exchange.poses)
         first, second = (inside & (points.target == t) for t in exchange.targets)
         target[first], target[second] = exchange.targets[1], exchange.targets[0]
-    return replace(points, target=target)
+    return replace(points, target=target, exchanges=exchanges)
 
 
 def _in_pose(measured: Array, body: Array) -> list[tuple[int, int, float, float]]:

@@ -1,7 +1,5 @@
 """Numbers of targets exchanged in some poses, whatever their share, and nothing said where there is none."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
