@@ -36,7 +36,7 @@ def work(context: Context) -> Outcome:
     notes += [
         f"targets {x.targets[0]} and {x.targets[1]} carry each other's number in {len(x.poses)} pose(s) "
         f"({', '.join(names[p] for p in x.poses[:6])}{' ...' if len(x.poses) > 6 else ''}): lengths on the body "
-        f"miss by {1000 * x.before:.3g} mm, exchanged by {1000 * x.after:.2g} mm; they are used exchanged: correct the table"
+        f"miss by {1000 * x.before:.3g} mm, exchanged by {1000 * x.after:.2g} mm; used exchanged: correct the table"
         for x in points.exchanges
     ]
     result = {"measured": len(points.pose), "rejected": len(points.rejected)}
