@@ -3,15 +3,14 @@
 Exit codes: 0 done, 1 the data cannot give a result, 2 wrong use.
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from pipeline.answers import Json, Quiet, answers, wrong_use
+from pipeline.cell_commands import cell
+from pipeline.command_line import CampaignPath, Json, Quiet, RunFolder, Workers, answers, wrong_use
 from pipeline.drift_commands import app as drift_app
 from pipeline.messages import LOG
 
@@ -23,14 +22,13 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="From photographs to an accurate robot: survey, measurement, identification, diagnosis, compensation.",
 )
+app.add_typer(cell, name="cell")
+app.add_typer(drift_app, name="drift")
 
-Workers = Annotated[int | None, typer.Option("--workers", min=1, max=1024, help="Processes for work on images.")]
-RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder of a finished campaign.")]
 RunOrDrift = Annotated[
     Path, typer.Argument(metavar="RUN", help="Run folder of a finished campaign, or state of a drift control.")
 ]
 AtCycle = Annotated[int | None, typer.Option("--at-cycle", help="Of a drift control: the model of an earlier cycle.")]
-CampaignPath = Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="Campaign folder, or its YAML file.")]
 
 
 def _check_stages(start: str | None, until: str | None) -> None:
@@ -248,9 +246,6 @@ def export(
         answer["files"] = [str(path) for path in written]
         for path in written:
             LOG.info(str(path))
-
-
-app.add_typer(drift_app, name="drift")
 
 
 def main() -> None:

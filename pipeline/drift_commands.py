@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from pipeline.answers import Json, Quiet, answers
+from pipeline.command_line import Json, Quiet, answers
 from pipeline.messages import LOG
 
 app = typer.Typer(

@@ -1,7 +1,5 @@
 """The report of a run: one HTML file without any outside resource, readable in a minute, printable."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from pipeline.report.chapters import all_chapters

@@ -1,7 +1,5 @@
 """From chapters to one HTML file: template, style and script inlined, every text escaped."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Where a report comes from: version, settings, hashes of the inputs."""
 
-from __future__ import annotations
-
 import json
 import platform
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Stage identify: geometry and elasticity of the robot from everything that was measured of it."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What was measured of a robot, as observation operators: for the identification and for the diagnosis."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 

@@ -6,8 +6,6 @@ comparable before everything is determined (Bayesian D-optimality: Chaloner and 
 exchange (Fedorov 1972) after that.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 

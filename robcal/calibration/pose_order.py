@@ -3,8 +3,6 @@
 Travel is the time of a synchronous joint movement, up to a factor: the largest joint change as a share of its range.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

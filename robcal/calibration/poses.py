@@ -6,8 +6,6 @@ order with short travel, and given approach directions that are balanced over th
 hysteresis can be distinguished from geometry.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Literal
 

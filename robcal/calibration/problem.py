@@ -4,8 +4,6 @@ The state carries the references of base and tool, into which their deviations a
 turns of base and tool need no care, and their six parameters always speak of small perturbations on the right.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -166,7 +164,7 @@ class Problem:
         theta[self._base], theta[self._tool] = 0.0, 0.0
         return State(theta, W, F)
 
-    def unweighted(self) -> Problem:
+    def unweighted(self) -> "Problem":
         """The same problem with all poses at full weight, those left out included."""
         return Problem(self.evaluator, self.columns, self.plain_whitener, None, self.prior)
 

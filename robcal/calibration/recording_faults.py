@@ -1,7 +1,5 @@
 """Faults of the recording that make a fit fail, told with the proof: the miss of the nominal robot after mending."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The diagnosis of a robot's recording, from fit to findings."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace

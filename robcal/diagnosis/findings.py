@@ -1,7 +1,5 @@
 """From accepted causes to findings: amplitudes, uncertainties, rivals, gain, sentence."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 

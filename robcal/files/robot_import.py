@@ -6,8 +6,6 @@ Universal Robots' ``kinematics.yaml`` (package ur_calibration): origin and orien
 the z axis of its own frame; behind the last one stands the controller's own flange (tool0).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal

@@ -6,8 +6,6 @@ names expressions of the robot's variables that are added to a number of a frame
 was measured: `observation_shift` gives the displacement of every observation per unit of each parameter.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field

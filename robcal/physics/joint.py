@@ -1,7 +1,5 @@
 """Causes that act in the direction of rotation of a joint: compliance, backlash, hysteresis, gears, references."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Sizes that deviations of robots usually have: the measure of priors, steps, and doubts about what is held."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import numpy as np

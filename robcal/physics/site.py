@@ -1,7 +1,5 @@
 """Where causes may act on a given robot: its joints, the covariates that were recorded, what is fitted already."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Causes in the structure of the robot: links, bearings, geometry held fixed, foundation, gravity, payload, warmth."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

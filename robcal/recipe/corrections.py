@@ -1,7 +1,5 @@
 """Measurements freed of what the diagnosis found in the measuring system: a verification speaks of the robot."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

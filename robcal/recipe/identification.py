@@ -1,7 +1,5 @@
 """From a joint log and measurements to an identified robot, with the checks that a recording needs."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What the images of surveys and of the station say about physics left out."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

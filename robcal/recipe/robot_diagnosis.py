@@ -1,7 +1,5 @@
 """The diagnosis of an identified robot: what it starts from, and the robot and measurements that it leaves behind."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 

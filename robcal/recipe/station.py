@@ -1,7 +1,5 @@
 """The station from identified marks: what its images show of themselves is corrected before the robot is looked at."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 

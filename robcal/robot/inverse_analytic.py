@@ -5,8 +5,6 @@ Both structures are solved with the subproblems of :mod:`robcal.robot.subproblem
 Branches stand in the second axis, eight of them; NaN where one does not exist.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from robcal.robot.chain import Chain

@@ -8,8 +8,6 @@ condition cannot be met the angles are NaN; a condition missed by rounding alone
 boundary, so an arm stretched out to its full reach still has its solution.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from robcal.transforms import Array

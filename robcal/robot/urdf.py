@@ -5,8 +5,6 @@ frame, this project about the line of roll, pitch or yaw: most joints translate 
 child's frame so that the axis is its x (kept track of, undone behind the last joint).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

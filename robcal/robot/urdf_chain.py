@@ -1,7 +1,5 @@
 """Reading a URDF safely, and the joints on the way from its root to its tip."""
 
-from __future__ import annotations
-
 import io
 import math
 import re

@@ -1,7 +1,5 @@
 """Slips of the joint log and of the robot file: senses, units, columns, couplings, axes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import combinations, permutations, product

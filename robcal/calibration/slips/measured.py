@@ -1,7 +1,5 @@
 """Slips of the measurements: columns, units, mirror images, conventions of orientation."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import permutations, product

@@ -1,7 +1,5 @@
 """Readings that are none: rows of zeros or of a sentinel, readings that stand still while the robot moves."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

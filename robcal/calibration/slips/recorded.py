@@ -1,7 +1,5 @@
 """What a slip is looked for in, and by how much the nominal robot misses it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -43,33 +41,33 @@ class Recorded:
     kernel: Kernel | None = None
 
     @classmethod
-    def of(cls, model: RobotModel, poses: PoseInputs, observations: Sequence[Observations]) -> Recorded:
+    def of(cls, model: RobotModel, poses: PoseInputs, observations: Sequence[Observations]) -> "Recorded":
         """With the nominal robot at the poses."""
         chain = chain_of(model)
         closed = any(isinstance(o, FrameObservations) for o in observations)
         kernel = None if closed else Kernel(model.nominal())
         return cls(model, chain, poses, forward(chain, poses.q), tuple(observations), kernel)
 
-    def with_q(self, q: Array) -> Recorded:
+    def with_q(self, q: Array) -> "Recorded":
         """The same with other joint angles (n, N)."""
         return replace(self, poses=self.poses.with_q(q), base_T_flange=forward(self.chain, q))
 
-    def with_frames(self, frames: Sequence[Frame]) -> Recorded:
+    def with_frames(self, frames: Sequence[Frame]) -> "Recorded":
         """The same with another chain in the robot file."""
         model = replace(self.model, frames=tuple(frames), parameters={}, terms=())
         return Recorded.of(model, self.poses, self.observations)
 
-    def paired(self, log: Ints, measured: Ints) -> Recorded:
+    def paired(self, log: Ints, measured: Ints) -> "Recorded":
         """Measurement ``measured[i]`` beside the joint angles of row ``log[i]``."""
         observations = tuple(o.subset(measured) for o in self.observations)
         poses, flange = self.poses.subset(log), self.base_T_flange[log]
         return replace(self, poses=poses, base_T_flange=flange, observations=observations)
 
-    def subset(self, rows: Ints) -> Recorded:
+    def subset(self, rows: Ints) -> "Recorded":
         """The given poses."""
         return self.paired(rows, rows)
 
-    def change(self, mend: Callable[[Observations], Observations]) -> Recorded:
+    def change(self, mend: Callable[[Observations], Observations]) -> "Recorded":
         """The same with other measurements."""
         return replace(self, observations=tuple(mend(o) for o in self.observations))
 

@@ -1,7 +1,5 @@
 """Rows of the joint log and of the measurements that do not belong together: shifted, exchanged."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from itertools import combinations
 

@@ -1,7 +1,5 @@
 """The search for slips: every alternative reading is tried, and told only if it mends the miss."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Deviations from the robot file that a robot may have, but larger than robots are off: zeros of joints, lengths."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 

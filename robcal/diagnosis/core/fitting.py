@@ -1,7 +1,5 @@
 """A robot fitted to a recording together with the causes that were accepted, linearised where the fit ended."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 

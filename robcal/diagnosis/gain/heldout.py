@@ -1,7 +1,5 @@
 """Gain on data kept out: verification poses, or folds of whole blocks of poses."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """One region of the workspace kept out altogether: effects that parameters absorb show outside the range only."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from robcal.diagnosis.core.fitting import Fit, damping, solve

@@ -5,8 +5,6 @@ diameter. Where the diagnosis of the images finds it, the body gets the diameter
 oriented (and everything measured) with it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

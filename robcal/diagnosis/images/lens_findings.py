@@ -1,8 +1,6 @@
 """What surveys and stations found and corrected by themselves, as causes: lens groups left out of a camera's file,
 cameras that moved, targets that sit elsewhere."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 

@@ -4,8 +4,6 @@ Charge that stays behind on read-out drags bright dots along the rows, the more 
 distance and tilt, so that poses and single targets are displaced, and nothing else tells it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 

@@ -5,8 +5,6 @@ single contradicting check length, or several that no scale explains, are left t
 in doubt.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy import stats
 

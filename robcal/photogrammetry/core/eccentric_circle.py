@@ -6,8 +6,6 @@ centre of its image is the pole of the line at infinity, hence the image of the 
 Source of dual conics: Hartley and Zisserman, Multiple View Geometry, 2nd ed., sections 2.2.3 and 8.3.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

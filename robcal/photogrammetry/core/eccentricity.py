@@ -11,8 +11,6 @@ Two effects, both exact to second order of the dot's image size, and a third on 
   seen, see :func:`rim_offset`.
 """
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import numpy as np

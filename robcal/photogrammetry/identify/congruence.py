@@ -1,7 +1,5 @@
 """Rival numberings: rigid motions that lay a body (mostly) on itself, as steps along a grid or half turns do."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial import cKDTree
 

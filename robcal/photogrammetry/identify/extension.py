@@ -1,7 +1,5 @@
 """The dots that a body's expected pose explains: matched and refined with the smaller uncertainties, round by round."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal

@@ -5,8 +5,6 @@ and every rival numbering that the body's own shape allows (:mod:`identify_congr
 before it is believed: a grid shifted by one step explains all dots but those of its edge.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Where a body is expected before a camera, and what its image then is: places, search radii, sizes of the dots."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Which dot is which target: ring codes and markers first, then geometry, in one image of a station."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

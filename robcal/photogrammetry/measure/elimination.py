@@ -1,7 +1,5 @@
 """Points and poses left out because distances contradict the body, and poses that carry no frame."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import Enum
 

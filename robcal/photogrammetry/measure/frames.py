@@ -1,7 +1,5 @@
 """From points to frames: the distance criterion, then the body fitted onto its targets with full covariance."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -76,7 +74,7 @@ class _BodyPoints:
     p_world: Array
     covariance: Array
 
-    def select(self, keep: NDArray[np.bool_]) -> _BodyPoints:
+    def select(self, keep: NDArray[np.bool_]) -> "_BodyPoints":
         return _BodyPoints(self.at[keep], self.row[keep], self.pose[keep], self.p_world[keep], self.covariance[keep])
 
 

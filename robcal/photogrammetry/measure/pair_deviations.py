@@ -1,7 +1,5 @@
 """Distances between the targets of a body judged pair by pair: expected length, standard deviation, tolerance."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -6,8 +6,6 @@ field that varies over the workspace, looks like robot physics: whoever weights 
 it for such.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from robcal.photogrammetry.measure.frames import MeasuredFrames

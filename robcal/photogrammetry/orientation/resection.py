@@ -4,8 +4,6 @@ Closed form for the start (IPPE for planes, SQPnP otherwise, three-point search 
 least squares with the marks' covariances. A plane seen by one camera has two poses of similar fit; both are returned.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -5,8 +5,6 @@ of cameras and body, however many poses there are. Source of the elimination: Tr
 (2000), "Bundle adjustment: a modern synthesis", section 6.1.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import pairwise
 

@@ -1,7 +1,5 @@
 """Identification over a whole station: images help one another through the other cameras."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Start and adjustments of a survey's network from the table of assignments."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Last steps of a survey: names of new targets, scale, frame, and the adjustment in the final datum."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Rounds of matching and adjustment that find the uncoded dots, the late images and the new targets of a survey."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

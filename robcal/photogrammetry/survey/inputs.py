@@ -1,7 +1,5 @@
 """What a survey is given: detections, the list of the body's targets, lengths, start values of the camera."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

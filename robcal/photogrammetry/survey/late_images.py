@@ -3,8 +3,6 @@
 Three points leave up to four poses; the other known targets, which must meet detections, select the right one.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial import cKDTree
 

@@ -1,7 +1,5 @@
 """Whether what gives the scale of a survey agrees with everything else that has a length: units go wrong first."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from robcal.errors import InvalidInput

@@ -1,7 +1,5 @@
 """Survey of a measuring body: from detected or identified image points to coordinates with full covariance."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal

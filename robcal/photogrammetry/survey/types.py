@@ -1,7 +1,5 @@
 """What goes into a survey of a measuring body and what comes out."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 from robcal.imaging.detections import Detections

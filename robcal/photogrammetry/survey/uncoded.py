@@ -1,7 +1,5 @@
 """Bodies without codes: dots with given coordinates are identified from their arrangement, image by image."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -5,8 +5,6 @@ are neither read nor written: with a template its visual and collision elements 
 and a calibration does not know (effort, velocity, moments of inertia) gets the assumptions named in the file.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 from xml.etree import ElementTree

@@ -1,12 +1,11 @@
-"""What all commands share: their common options, their result line, errors as one line and an exit code."""
-
-from __future__ import annotations
+"""What all commands share: options, one line for errors on purpose, exit codes, the line for programs."""
 
 import json
 import tempfile
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -17,6 +16,9 @@ from robcal.errors import RobcalError
 
 Quiet = Annotated[bool, typer.Option("-q", "--quiet", help="Only warnings and errors on standard error.")]
 Json = Annotated[bool, typer.Option("--json", help="One result line for programs on standard output.")]
+Workers = Annotated[int | None, typer.Option("--workers", min=1, max=1024, help="Processes for work on images.")]
+RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder of a finished campaign.")]
+CampaignPath = Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="Campaign folder, or its YAML file.")]
 
 
 @contextmanager
@@ -53,6 +55,6 @@ def _fail(command: str, as_json: bool, sentence: str) -> None:
 
 
 def wrong_use(sentence: str) -> None:
-    """End with exit code 2 and one sentence."""
+    """Say what is wrong with the use of a command and end with exit code 2."""
     typer.echo(f"wrong use: {sentence}", err=True)
     raise typer.Exit(2)
