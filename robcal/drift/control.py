@@ -28,7 +28,7 @@ SLOW = 0.1
 """Share by which one tour changes the noise that is expected of the next."""
 
 
-HELD_SHARE = 0.25
+HELD_SHARE = 0.1
 """While a jump is on, so much of the thermal change is allowed for."""
 
 

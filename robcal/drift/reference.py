@@ -75,7 +75,8 @@ class Readings:
 
     def subset(self, rows: Ints | NDArray[np.bool_] | Sequence[int]) -> Readings:
         """Some of the rows (indices or mask)."""
-        at = np.arange(len(self))[np.asarray(rows)]
+        chosen = np.asarray(rows)
+        at = np.arange(len(self))[chosen if chosen.dtype == bool else chosen.astype(np.intp)]
         return Readings(
             self.cycle[at],
             self.time[at],
