@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
+from pipeline.cell_commands import cell
 from pipeline.command_line import CampaignPath, Json, Quiet, RunFolder, Workers, answers, wrong_use
 from pipeline.messages import LOG
 
@@ -20,6 +21,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="From photographs to an accurate robot: survey, measurement, identification, diagnosis, compensation.",
 )
+app.add_typer(cell, name="cell")
 
 
 def _check_stages(start: str | None, until: str | None) -> None:

@@ -15,6 +15,7 @@ GRAVITY_SAG = Kind(
     "robot",
     "sag under weights that are not stated",
     "{where} sags about {direction} by {sag_deg:.4f} deg under weights that the robot file does not state",
+    expected=True,
 )
 KNOWN_TO_GIVE = 3.0
 """Prior weight of the sag about a joint's own axis: every joint gives way there, and every arm has weight."""
