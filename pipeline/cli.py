@@ -12,6 +12,7 @@ import typer
 from pipeline.cell_commands import cell
 from pipeline.command_line import CampaignPath, Json, Quiet, RunFolder, Workers, answers, wrong_use
 from pipeline.drift_commands import app as drift_app
+from pipeline.mastering_commands import mastering
 from pipeline.messages import LOG
 
 app = typer.Typer(
@@ -24,6 +25,7 @@ app = typer.Typer(
 )
 app.add_typer(cell, name="cell")
 app.add_typer(drift_app, name="drift")
+app.add_typer(mastering)
 
 RunOrDrift = Annotated[
     Path, typer.Argument(metavar="RUN", help="Run folder of a finished campaign, or state of a drift control.")
