@@ -11,6 +11,7 @@ import typer
 
 from pipeline.cell_commands import cell
 from pipeline.command_line import CampaignPath, Json, Quiet, RunFolder, Workers, answers, wrong_use
+from pipeline.mastering_commands import mastering
 from pipeline.messages import LOG
 
 app = typer.Typer(
@@ -22,6 +23,7 @@ app = typer.Typer(
     help="From photographs to an accurate robot: survey, measurement, identification, diagnosis, compensation.",
 )
 app.add_typer(cell, name="cell")
+app.add_typer(mastering)
 
 
 def _check_stages(start: str | None, until: str | None) -> None:

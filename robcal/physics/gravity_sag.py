@@ -5,8 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from robcal.cause import Kind
-from robcal.physics.cause import DEG, Array, Basis, Constants, Entry, RobotCause
-from robcal.physics.prior_scale import DEFLECTION
+from robcal.physics.cause import DEFLECTION, DEG, Array, Basis, Constants, Entry, RobotCause
 from robcal.physics.site import LETTER_OF_KIND, Joint, RobotSite, each_joint
 from robcal.robot.gravity_regressor import direction_of_gravity, expressions, regressor
 from robcal.robot.model import RobotModel

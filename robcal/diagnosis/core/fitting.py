@@ -7,8 +7,7 @@ import numpy as np
 
 from robcal.diagnosis.core.recording import Recording, observation_data
 from robcal.diagnosis.scan.statistics import orthonormal_basis
-from robcal.physics.cause import Array, Constants, LinearCause, ObservationCause
-from robcal.physics.prior_scale import prior_scales
+from robcal.physics.cause import Array, Constants, LinearCause, ObservationCause, prior_scales
 from robcal.robot.kernel import Kernel, PoseInputs
 from robcal.robot.kernel_cache import kernel_of
 from robcal.robot.model import RobotModel, Term

@@ -18,8 +18,7 @@ from robcal.diagnosis.scan.posterior import refine
 from robcal.diagnosis.scan.statistics import orthonormal_basis
 from robcal.diagnosis.scan.tangents import Laws
 from robcal.diagnosis.search.admissible import possible, refusal
-from robcal.physics.cause import Array, Constants, Key, LinearCause
-from robcal.physics.prior_scale import prior_scale
+from robcal.physics.cause import Array, Constants, Key, LinearCause, prior_scale
 from robcal.robot.model import RobotModel
 
 SAME_SCATTER = 0.2
