@@ -33,6 +33,9 @@ Quiet = Annotated[bool, typer.Option("-q", "--quiet", help="Only warnings and er
 Json = Annotated[bool, typer.Option("--json", help="One result line for programs on standard output.")]
 Workers = Annotated[int | None, typer.Option("--workers", min=1, max=1024, help="Processes for work on images.")]
 RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder of a finished campaign.")]
+InstrumentName = Annotated[
+    str | None, typer.Option("--instrument", metavar="NAME", help="In the world and with the tool of this instrument.")
+]
 CampaignPath = Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="Campaign folder, or its YAML file.")]
 
 
@@ -161,6 +164,7 @@ def predict(
     nominal: Annotated[
         bool, typer.Option("--nominal", help="The uncalibrated robot after the best cell calibration.")
     ] = False,
+    instrument: InstrumentName = None,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
@@ -168,7 +172,7 @@ def predict(
     with _answers("predict", as_json, quiet) as answer:
         from pipeline.prediction import predict_run
 
-        answer.update(predict_run(run_folder, poses, out, nominal=nominal))
+        answer.update(predict_run(run_folder, poses, out, nominal=nominal, instrument=instrument))
         for sentence in answer["warnings"]:
             LOG.warning(sentence)
         LOG.info(f"{answer['poses']} frames in {out}")
@@ -190,6 +194,7 @@ def compensate(
     skip: Annotated[
         bool, typer.Option("--skip-unreachable", help="Leave out frames that the robot cannot reach.")
     ] = False,
+    instrument: InstrumentName = None,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
@@ -206,7 +211,14 @@ def compensate(
         targets, in_base = kind == "frames", system == "base"
         answer.update(
             compensate_run(
-                run_folder, frames, out, as_frames=targets, in_base=in_base, skip_unreachable=skip, program=program
+                run_folder,
+                frames,
+                out,
+                as_frames=targets,
+                in_base=in_base,
+                skip_unreachable=skip,
+                program=program,
+                instrument=instrument,
             )
         )
         for sentence in answer["warnings"]:
