@@ -1,7 +1,5 @@
 """The adjusted images of a run, as the recipe takes them."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 

@@ -1,7 +1,5 @@
 """Bodies as the library knows them: from their files, or from a survey where there was one."""
 
-from __future__ import annotations
-
 from pipeline.artifacts import FRAMES, surveyed_body
 from pipeline.campaign import Campaign
 from pipeline.runs import Run

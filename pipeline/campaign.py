@@ -1,7 +1,5 @@
 """A campaign: what was recorded and what is what, read and checked before any stage runs. Never written to."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """campaign.yaml (format robcal/campaign-1): the entries as a person writes them."""
 
-from __future__ import annotations
-
 import re
 from typing import Annotated, Any, Literal
 

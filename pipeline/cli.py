@@ -3,22 +3,16 @@
 Exit codes: 0 done, 1 the data cannot give a result, 2 wrong use.
 """
 
-from __future__ import annotations
-
-import json
 import sys
-import tempfile
-import traceback
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from pipeline.json_io import plain
-from pipeline.messages import LOG, show
-from robcal.errors import RobcalError
+from pipeline.cell_commands import cell
+from pipeline.command_line import CampaignPath, InstrumentName, Json, Quiet, RunFolder, Workers, answers, wrong_use
+from pipeline.mastering_commands import mastering
+from pipeline.messages import LOG
 
 app = typer.Typer(
     name="pipeline",
@@ -28,53 +22,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="From photographs to an accurate robot: survey, measurement, identification, diagnosis, compensation.",
 )
-
-Quiet = Annotated[bool, typer.Option("-q", "--quiet", help="Only warnings and errors on standard error.")]
-Json = Annotated[bool, typer.Option("--json", help="One result line for programs on standard output.")]
-Workers = Annotated[int | None, typer.Option("--workers", min=1, max=1024, help="Processes for work on images.")]
-RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder of a finished campaign.")]
-InstrumentName = Annotated[
-    str | None, typer.Option("--instrument", metavar="NAME", help="In the world and with the tool of this instrument.")
-]
-CampaignPath = Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="Campaign folder, or its YAML file.")]
-
-
-@contextmanager
-def _answers(command: str, as_json: bool, quiet: bool) -> Iterator[dict[str, Any]]:
-    """Run a command's body; errors on purpose become one line and exit code 1, a mistake of the program too."""
-    answer: dict[str, Any] = {}
-    show(quiet)
-    try:
-        yield answer
-    except typer.Exit:
-        raise
-    except RobcalError as error:
-        _fail(command, as_json, " ".join(str(error).split()))
-    except OSError as error:
-        where = f"{error.filename}: " if error.filename else ""
-        _fail(command, as_json, f"{where}{error.strerror or error}")
-    except MemoryError:
-        _fail(command, as_json, "not enough memory: use smaller images or fewer at once")
-    except Exception as error:
-        with tempfile.NamedTemporaryFile(
-            "w", prefix="robcal-", suffix=".log", delete=False, encoding="utf-8", errors="backslashreplace"
-        ) as stream:
-            stream.write(traceback.format_exc())
-        _fail(command, as_json, f"internal error ({type(error).__name__}): the traceback is in {stream.name}")
-    if as_json:
-        typer.echo(json.dumps(plain({"ok": True, "command": command, **answer})))
-
-
-def _fail(command: str, as_json: bool, sentence: str) -> None:
-    typer.echo(f"error: {sentence}", err=True)
-    if as_json:
-        typer.echo(json.dumps({"ok": False, "command": command, "error": sentence}))
-    raise typer.Exit(1)
-
-
-def _wrong_use(sentence: str) -> None:
-    typer.echo(f"wrong use: {sentence}", err=True)
-    raise typer.Exit(2)
+app.add_typer(cell, name="cell")
+app.add_typer(mastering)
 
 
 def _check_stages(start: str | None, until: str | None) -> None:
@@ -83,9 +32,9 @@ def _check_stages(start: str | None, until: str | None) -> None:
 
     for name in (until, start):
         if name is not None and name not in STAGE_NAMES:
-            _wrong_use(f"there is no stage '{name}'{proposal(name, list(STAGE_NAMES))}")
+            wrong_use(f"there is no stage '{name}'{proposal(name, list(STAGE_NAMES))}")
     if start and until and STAGE_NAMES.index(until) < STAGE_NAMES.index(start):
-        _wrong_use(f"stage '{until}' comes before '{start}': --until must not lie before --from")
+        wrong_use(f"stage '{until}' comes before '{start}': --until must not lie before --from")
 
 
 def _summary(done: Any) -> dict[str, Any]:
@@ -109,7 +58,7 @@ def run(
 
     Stages: detect, survey, orient, measure, frames, identify, diagnose, verify, report.
     """
-    with _answers("run", as_json, quiet) as answer:
+    with answers("run", as_json, quiet) as answer:
         _check_stages(start, until)
         from pipeline.runner import run_campaign
 
@@ -128,7 +77,7 @@ def survey(
     as_json: Json = False,
 ) -> None:
     """Only the bundle adjustment of the campaign's bodies."""
-    with _answers("survey", as_json, quiet) as answer:
+    with answers("survey", as_json, quiet) as answer:
         from pipeline.commands import survey_campaign
 
         done = survey_campaign(campaign, body, out, workers)
@@ -145,7 +94,7 @@ def diagnose(
     as_json: Json = False,
 ) -> None:
     """Say what physics the model lacks: only the diagnosis (also a stage of `run`)."""
-    with _answers("diagnose", as_json, quiet) as answer:
+    with answers("diagnose", as_json, quiet) as answer:
         from pipeline.commands import diagnose_place
 
         done, diagnosis = diagnose_place(place, out, workers)
@@ -169,7 +118,7 @@ def predict(
     as_json: Json = False,
 ) -> None:
     """Say where the calibrated robot's tool really is, in the measuring system's coordinates."""
-    with _answers("predict", as_json, quiet) as answer:
+    with answers("predict", as_json, quiet) as answer:
         from pipeline.prediction import predict_run
 
         answer.update(predict_run(run_folder, poses, out, nominal=nominal, instrument=instrument))
@@ -200,12 +149,12 @@ def compensate(
 ) -> None:
     """Find the commands that bring the real tool to the wanted frames."""
     if kind not in ("joints", "frames"):
-        _wrong_use(f"--as is 'joints' or 'frames', not '{kind}'")
+        wrong_use(f"--as is 'joints' or 'frames', not '{kind}'")
     if system not in ("world", "base"):
-        _wrong_use(f"--in is 'world' or 'base', not '{system}'")
+        wrong_use(f"--in is 'world' or 'base', not '{system}'")
     if program not in (None, "krl", "rapid", "urscript"):
-        _wrong_use(f"--program is 'krl', 'rapid' or 'urscript', not '{program}'")
-    with _answers("compensate", as_json, quiet) as answer:
+        wrong_use(f"--program is 'krl', 'rapid' or 'urscript', not '{program}'")
+    with answers("compensate", as_json, quiet) as answer:
         from pipeline.prediction import compensate_run
 
         targets, in_base = kind == "frames", system == "base"
@@ -231,7 +180,7 @@ def compensate(
 @app.command()
 def report(run_folder: RunFolder, quiet: Quiet = False, as_json: Json = False) -> None:
     """Write the report again."""
-    with _answers("report", as_json, quiet) as answer:
+    with answers("report", as_json, quiet) as answer:
         from pipeline.commands import report_again
 
         path = report_again(run_folder)
@@ -247,7 +196,7 @@ def demo(
     as_json: Json = False,
 ) -> None:
     """Render a small campaign and run it; the last line is the path of the report."""
-    with _answers("demo", as_json, quiet) as answer:
+    with answers("demo", as_json, quiet) as answer:
         from pipeline.commands import run_demo
 
         done = run_demo(out, workers)
@@ -264,7 +213,7 @@ def poses(
     as_json: Json = False,
 ) -> None:
     """Generate measuring poses: within limits, visible, free of collisions, as few as the wanted accuracy needs."""
-    with _answers("poses", as_json, quiet) as answer:
+    with answers("poses", as_json, quiet) as answer:
         from pipeline.pose_generation import generate_poses
 
         answer.update(generate_poses(config, out))
@@ -283,8 +232,8 @@ def export(
 ) -> None:
     """Export the calibrated robot for controllers and simulators."""
     if c is None and urdf is None:
-        _wrong_use("name what to write: --c FOLDER, --urdf FILE, or both")
-    with _answers("export", as_json, quiet) as answer:
+        wrong_use("name what to write: --c FOLDER, --urdf FILE, or both")
+    with answers("export", as_json, quiet) as answer:
         from pipeline.exports import export_run
 
         written = export_run(run_folder, c, urdf)

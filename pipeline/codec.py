@@ -3,8 +3,6 @@
 The structure stands as JSON text beside the arrays; classes are looked up by name inside this project only.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import enum
 import importlib

@@ -1,7 +1,5 @@
 """What the commands do beyond running all stages of a campaign."""
 
-from __future__ import annotations
-
 import tempfile
 from pathlib import Path
 from typing import Any

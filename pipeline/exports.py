@@ -1,7 +1,5 @@
 """Command export: the calibrated robot as C99 source and as URDF."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from pipeline.runs import open_run

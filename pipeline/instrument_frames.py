@@ -1,7 +1,5 @@
 """Worlds and tools of a campaign's instruments, from what campaign.yaml states of them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import numpy as np

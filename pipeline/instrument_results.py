@@ -1,7 +1,5 @@
 """Instruments in result.json, and what is told of them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """JSON files written by this program, and the hash of plain data."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Mapping

@@ -4,8 +4,6 @@ All of it goes through ``LOG``, the logger ``pipeline``: INFO is what is going o
 DEBUG what belongs into the file alone.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager

@@ -3,8 +3,6 @@
 Workers are spawned, not forked: a forked one would inherit the lock of the run folder and outlive a killed run.
 """
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import threading

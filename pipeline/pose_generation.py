@@ -1,7 +1,5 @@
 """Command poses: a description of the cell (format robcal/poses-1) in, a table of measuring poses out."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal

@@ -1,7 +1,5 @@
 """Commands predict and compensate: tables in, tables out, on the robot of a finished run."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Runs the stages of a campaign in order: skips what is up to date, resumes what was interrupted."""
 
-from __future__ import annotations
-
 import os
 import time
 from collections.abc import Sequence

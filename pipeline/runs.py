@@ -4,8 +4,6 @@ Every file is written to a temporary name and renamed. A stage is done when its 
 the record is written last, so a run killed at any moment resumes with the stage it was in.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Errors the library raises on purpose. The class says what kind, the message which row or parameter and the remedy."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 

@@ -10,8 +10,6 @@ Conventions (the one place where they are stated):
 All functions broadcast over leading axes; lengths in metres, angles in radians.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 

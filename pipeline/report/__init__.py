@@ -1,13 +1,10 @@
 """The report of a run: one HTML file without any outside resource, readable in a minute, printable."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from pipeline.report.chapters import all_chapters
 from pipeline.report.material import Material
-from pipeline.report.page import render
-from pipeline.report.provenance import provenance
+from pipeline.report.page import provenance, render
 from pipeline.report.verdict import verdict_of
 from pipeline.runs import Run
 from robcal.files.storage import write_text

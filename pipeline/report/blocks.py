@@ -1,7 +1,5 @@
 """What a report is made of: chapters of text, tables, figures, pictures and key figures. No HTML here."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """The chapters of the report in their order."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 
 from pipeline.report.blocks import Chapter

@@ -1,7 +1,5 @@
 """Chapter: what the model left out, how it is known, and what would settle what is open."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

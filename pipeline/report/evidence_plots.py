@@ -1,7 +1,5 @@
 """The plot that convinces: what each pose says on its own about a cause, against its covariate, with the fitted law."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Plots for causes found in images: the lens' curve with its uncertainty, and what each cause gains."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Chapters: detected targets on sample images, and image residuals."""
 
-from __future__ import annotations
-
 import base64
 from collections.abc import Mapping
 

@@ -1,7 +1,5 @@
 """What a run holds for its report. A stage that did not run leaves None; nothing here computes."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path

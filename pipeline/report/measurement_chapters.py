@@ -1,7 +1,5 @@
 """Chapter: the measured points and frames, judged by the lengths between the body's targets."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from pipeline.report.blocks import Block, Chapter, Figure, Text, table

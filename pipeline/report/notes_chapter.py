@@ -1,7 +1,5 @@
 """Chapters: what was rejected, assumed and warned of; the files to use."""
 
-from __future__ import annotations
-
 from collections import Counter
 
 from pipeline.report.blocks import Block, Bullets, Chapter, Text, table

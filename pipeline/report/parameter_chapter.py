@@ -1,7 +1,5 @@
 """Chapter: what was identified, how certain it is, and what the data could not tell apart."""
 
-from __future__ import annotations
-
 import re
 from typing import Any
 

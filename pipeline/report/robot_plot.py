@@ -1,7 +1,5 @@
 """The robot as a stick figure with the places marked where something was found."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Colours and layouts of the plots: the palette of Okabe and Ito (2008), told apart by all kinds of colour vision."""
 
-from __future__ import annotations
-
 import html
 from collections.abc import Iterable, Mapping
 from typing import Any

@@ -1,7 +1,5 @@
 """Chapters: the survey's numbers, and all networks in space."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from pipeline.report.blocks import Block, Chapter, Figure, Table, Text, table

@@ -1,7 +1,5 @@
 """The top of the report: one verdict a person can act on."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Chapter: how good the calibrated robot is where it was not identified."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What a stage is, and what it gets to work with."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Stage detect: every image -> targets with sub-pixel centres. Each image has its own cache by content."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Stage diagnose: which physics the model leaves out; the extended model serves everything after it."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 from typing import Any
@@ -13,11 +11,12 @@ from pipeline.campaign import Campaign
 from pipeline.json_io import write_json
 from pipeline.messages import LOG
 from pipeline.stages.base import Context, Outcome, Stage, no_files
-from robcal.diagnosis.content import diagnosis_content, with_images
+from robcal.diagnosis.content import diagnosis_content, with_exchanges, with_images
 from robcal.diagnosis.core.result import Diagnosis
 from robcal.diagnosis.images.diagnosis import ImageFinding
 from robcal.diagnosis.search.selection import SelectionSettings
 from robcal.files.tables import write_table
+from robcal.photogrammetry.station.contradictions import TARGET_SWAPPED
 from robcal.recipe.robot_diagnosis import Measured, RobotDiagnosis, diagnose_robot
 from robcal.recipe.robot_witness import with_station_moves
 
@@ -47,6 +46,8 @@ def work(context: Context) -> Outcome:
     if station is not None and found.recording.own_station:
         content = with_station_moves(content, station.names, found.recording, diagnosis.model)
     content = content | _in_force(found)
+    exchanges = measured.points.exchanges if measured.points is not None else ()
+    content = with_exchanges(content, exchanges, campaign.poses.names)
     write_json(run.diagnosis, content)
     outputs = [run.diagnosis, run.save(artifacts.CALIBRATED, found.robot), run.save(artifacts.EVIDENCE, found.evidence)]
     if content.get("next_poses"):
@@ -57,11 +58,13 @@ def work(context: Context) -> Outcome:
     if found.corrected is not None:
         outputs.append(run.save(artifacts.CORRECTED, found.corrected))
     told = [f.statement for f in images.findings] + [f.statement for f in diagnosis.findings]
+    told = [f"targets {x.targets[0]} and {x.targets[1]} exchanged in {len(x.poses)} pose(s)" for x in exchanges] + told
     notes = told or ["nothing missing: the model explains the data"]
     if diagnosis.findings:
         notes = [*notes, found.in_force.reason]
-    outcome = _result(diagnosis) | {"mismatch": content["mismatch"]} | _in_force(found)
-    outcome["causes"] = [*_named(images.findings), *_result(diagnosis)["causes"]]
+    outcome = _result(diagnosis) | {"mismatch": content["mismatch"], "p_value": content["p_value"]} | _in_force(found)
+    swapped = [{"cause": TARGET_SWAPPED.name, "where": str(x.targets[0]), "direction": None} for x in exchanges]
+    outcome["causes"] = [*swapped, *_named(images.findings), *_result(diagnosis)["causes"]]
     return Outcome({"diagnosis": outcome}, outputs, notes)
 
 

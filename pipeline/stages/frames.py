@@ -1,7 +1,5 @@
 """Stage frames: the distance criterion, then one frame with covariance from the targets of each pose."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

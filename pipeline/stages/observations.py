@@ -1,7 +1,5 @@
 """What the robot stages work on: the measurements as observation operators, for identification and for diagnosis."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from pipeline.artifacts import FRAMES, POINTS

@@ -1,7 +1,5 @@
 """Stage orient: which dot is which target, and where the station's cameras stand."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping
 from functools import partial

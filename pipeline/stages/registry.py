@@ -1,7 +1,5 @@
 """The stages in the order in which they run."""
 
-from __future__ import annotations
-
 from pipeline.stages import detect, diagnose, frames, identify, measure, orient, report, survey, verify
 from pipeline.stages.base import Stage
 

@@ -1,7 +1,5 @@
 """Stage report: report.html from what lies in the run folder."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from pipeline.runs import Run

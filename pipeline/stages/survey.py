@@ -1,7 +1,5 @@
 """Stage survey: bundle adjustment of each body that was photographed, with self-calibration of the camera."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any

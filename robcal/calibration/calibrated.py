@@ -1,7 +1,5 @@
 """The calibrated robot: a model, how sure its parameters are, and the one function that predicts with it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal, Self
@@ -93,7 +91,7 @@ class CalibratedRobot:
         given = {name: np.full(len(log), value) for name, value in self.defaults.items()}
         return self.kernel.poses(log.q, log.payload, {**given, **log.stated()})
 
-    def bare(self) -> CalibratedRobot:
+    def bare(self) -> "CalibratedRobot":
         """The nominal robot in the best cell.
 
         Raises

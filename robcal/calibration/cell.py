@@ -1,7 +1,5 @@
 """Base and tool of a robot whose other parameters are known."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -7,8 +7,6 @@ Collision Detection* (2005), section 5.1.9.
 Weakness: default capsules are guessed from the nominal geometry; where clearance matters, give the true ones.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -5,8 +5,6 @@ flange turns about two directions that are not parallel (Zhuang, Roth, Sudhakar 
 hand-eye part). With fewer, a part of the tool stays where it was constructed, and the base with it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping
 
 import numpy as np

@@ -6,8 +6,6 @@ Elasticities are taken up only where the data ask for them, by F-tests on the id
 accuracy at other poses, a missing one too.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -5,8 +5,6 @@ elimination of dependent parameters, choice of elasticities by evidence, outlier
 Source of the adjustment statistics: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, chapter 4.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -59,7 +57,7 @@ class IdentifyOptions:
     joint_sigma: float | Sequence[float] | None = None
     priors: Mapping[str, float] = field(default_factory=dict)
     covariance: Literal["auto", "stated", "estimated"] = "auto"
-    termination: TerminationSettings = field(default_factory=lambda: TerminationSettings(negligible=1e-4))
+    termination: TerminationSettings = field(default_factory=lambda: TerminationSettings(60, negligible=1e-4))
 
 
 @dataclass(frozen=True, kw_only=True)

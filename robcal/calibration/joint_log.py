@@ -1,7 +1,5 @@
 """What was commanded: the poses of a recording in the order in which they were driven."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
@@ -45,7 +43,7 @@ class JointLog:
         """Whether any approach direction was taken from the order of the poses."""
         return bool(self.inferred)
 
-    def as_stated(self) -> JointLog:
+    def as_stated(self) -> "JointLog":
         """The log without what was inferred: approach 0 where no column states it, as for poses to predict."""
         approach = self.approach.copy()
         approach[:, list(self.inferred)] = 0.0

@@ -5,8 +5,6 @@ does to the measured rows. Both are estimated by restricted maximum likelihood (
 Parameter Estimation, section 3.6), which allows for the parameters taken from the same data.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 

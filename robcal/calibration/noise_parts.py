@@ -4,8 +4,6 @@ Pure error is what exact repetitions scatter by, whatever the model; lack of fit
 tested by the ratio of both variances (Draper and Smith 1998, Applied Regression Analysis, section 2.1).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal

@@ -5,8 +5,6 @@ Every operator gives, for tool frames ``T = world_T_tool`` (n, 4, 4) of all pose
 (m, d, d). So one solver serves 6D frames, 3D points, 1D distances, a sensor in the hand, and raw pixels, also mixed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar, Protocol, TypeVar
@@ -135,7 +133,7 @@ class FrameObservations(_Rows):
     @classmethod
     def isotropic(
         cls, world_T_tool: ArrayLike, sigma: float, sigma_angle: float, pose: ArrayLike | None = None
-    ) -> FrameObservations:
+    ) -> "FrameObservations":
         """One frame a pose with the same standard deviations (m, rad) in all directions."""
         T = np.asarray(world_T_tool, dtype=float)
         C = np.diag([sigma**2] * 3 + [sigma_angle**2] * 3)

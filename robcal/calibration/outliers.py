@@ -5,8 +5,6 @@ many poses and has long tails of its own: there the limit follows the tails, and
 none is left out.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@ Random joint values alone seldom show a plate to two cameras. So half of the tri
 robot reaches, the body's face turned towards the cameras, and all branches of the inverse kinematics.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 

@@ -4,8 +4,6 @@ The state carries the references of base and tool, into which their deviations a
 turns of base and tool need no care, and their six parameters always speak of small perturbations on the right.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -180,7 +178,7 @@ class Problem:
         theta[self.columns] += step
         return self.evaluator.fold(theta, state)
 
-    def unweighted(self) -> Problem:
+    def unweighted(self) -> "Problem":
         """The same problem with all poses at full weight, those left out included."""
         return Problem(self.evaluator, self.columns, self.plain_whitener, None, self.prior)
 

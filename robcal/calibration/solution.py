@@ -4,8 +4,6 @@ Whether a parameter is dependent is decided from the normal equations at a state
 since deviations make some parameters visible that are dependent at nominal (parallel axes), and hide others.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -55,7 +53,7 @@ class Normals:
     b: Array
     sum_of_squares: float
 
-    def shifted(self, back: Array) -> Normals:
+    def shifted(self, back: Array) -> "Normals":
         """For residuals from which the linear effect of going back by ``back`` (p,) is taken: ``r + J back``."""
         turned = self.N @ back
         return Normals(self.N, self.b + turned, self.sum_of_squares + float(back @ (2.0 * self.b + turned)))

@@ -9,8 +9,6 @@
 - Pixels: two or more cameras intersect points, one camera gives the frame of a body by resection.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import permutations, product
 from typing import Any

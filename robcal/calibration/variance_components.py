@@ -1,7 +1,5 @@
 """Identification from measurements that state no uncertainty: variance components from the residuals."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

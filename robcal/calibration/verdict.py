@@ -3,8 +3,6 @@
 A grade says what a stranger with a second instrument may rely on: 'good' only where nothing speaks against it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Literal

@@ -4,8 +4,6 @@ Errors are ``e = |(measured - model) t|`` for test vectors t of 0, 490 and 980 m
 tool, beside those of the nominal robot after the best fit of base and tool on the identification poses.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -50,7 +48,7 @@ class ErrorStatistics:
     rms: float
 
     @classmethod
-    def of(cls, errors: ArrayLike) -> ErrorStatistics:
+    def of(cls, errors: ArrayLike) -> "ErrorStatistics":
         """Statistics of errors (n,); NaN where there are none."""
         e = np.asarray(errors, dtype=float)
         if e.size == 0:

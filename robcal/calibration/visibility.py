@@ -5,8 +5,6 @@ appears large enough, and no link of the robot stands in the line of sight. From
 information on the body's frame follows by the derivatives of the projection (collinearity equations).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

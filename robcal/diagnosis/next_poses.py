@@ -1,7 +1,5 @@
 """Poses, payloads and approach directions that would tell rival causes apart."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

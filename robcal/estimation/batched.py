@@ -5,8 +5,6 @@ have ended are not evaluated any more. Sources: Levenberg (1944); Marquardt (196
 diagonal; Madsen, Nielsen, Tingleff (2004), "Methods for non-linear least squares problems", section 3.2.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -31,7 +29,7 @@ class NormalEquations:
     cost: Array
 
     @classmethod
-    def of_rows(cls, group: IntArray, r: Array, J: Array, n: int) -> NormalEquations:
+    def of_rows(cls, group: IntArray, r: Array, J: Array, n: int) -> "NormalEquations":
         """Sum of whitened residuals (m, d) and Jacobians (m, d, p) over the problem ``group`` (m,) of each row.
 
         Rows that are not finite take no part in the step but make the cost of their problem infinite.
@@ -45,11 +43,11 @@ class NormalEquations:
         cost[group[~finite]] = np.inf
         return cls(matrix, right, cost)
 
-    def take(self, rows: IntArray | NDArray[np.bool_]) -> NormalEquations:
+    def take(self, rows: IntArray | NDArray[np.bool_]) -> "NormalEquations":
         """The chosen problems."""
         return NormalEquations(self.matrix[rows], self.right[rows], self.cost[rows])
 
-    def put(self, rows: IntArray, other: NormalEquations, chosen: NDArray[np.bool_]) -> None:
+    def put(self, rows: IntArray, other: "NormalEquations", chosen: NDArray[np.bool_]) -> None:
         """The chosen problems of another system into ``rows`` of this one, in place."""
         self.matrix[rows], self.right[rows] = other.matrix[chosen], other.right[chosen]
         self.cost[rows] = other.cost[chosen]

@@ -1,7 +1,5 @@
 """Covariance, conditioning and global test of a whitened least-squares estimate."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

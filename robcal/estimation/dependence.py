@@ -1,7 +1,5 @@
 """Parameters that the data cannot tell apart: elimination in an order of preference."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Sums over groups of rows (all marks of an image, all rays of a point): the inner loops of batched adjustments."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse

@@ -5,8 +5,6 @@ one does not (Levenberg 1944, Marquardt 1963), and fades again. What a problem h
 (robust weights, small corrections) may change from one linearisation to the next.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ Sources: Baarda (1968), "A testing procedure for use in geodetic networks" (w-te
 Foerstner (1979), variance components by sums of squares over redundancies.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy import stats
 

@@ -4,8 +4,6 @@ Sources: Huber (1964); Geman and McClure (1987); Holland and Welsch (1977), iter
 weight multiplies the squared residual; residuals that are not finite (behind a camera) have weight zero.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from robcal.estimation.grouping import Array

@@ -5,8 +5,6 @@ Sources: Brown (1976), "The bundle adjustment - progress and prospects"; Triggs,
 10(56):181-207.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Bodies (format robcal/body-1): targets with codes, diameters and coordinates, as given or as surveyed."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

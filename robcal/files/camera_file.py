@@ -1,7 +1,5 @@
 """Camera files (format robcal/camera-1): interior orientation and, optionally, where the camera stands."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path

@@ -5,8 +5,6 @@ All but Metashape count pixels as OpenCV does, from the centre of the top-left o
 (0.5, 0.5) into the centre of the top-left pixel, and names the two tangential coefficients the other way round.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Frames in tables: six numbers, their covariance, and its relation to the perturbation used inside."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from robcal.transforms import Array, twist_from_six, xyzrpy_from_frame

@@ -1,7 +1,5 @@
 """Image files: listing a folder, reading grey values of 8 or 16 bit, telling broken files."""
 
-from __future__ import annotations
-
 import os
 import re
 import struct

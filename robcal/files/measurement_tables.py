@@ -3,8 +3,6 @@
 The kind of a table is told by its columns. Everything is converted to metres and radians here.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,7 +11,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from robcal.calibration.slips import empty_readings, frozen_readings
+from robcal.calibration.recording_errors import empty_readings, frozen_readings
 from robcal.errors import InvalidInput
 from robcal.files.frame_tables import SIX, frame_covariance_columns, twist_covariance
 from robcal.files.tables import Table, read_table
@@ -55,7 +53,7 @@ class MeasuredTable:
     def __len__(self) -> int:
         return len(self.pose)
 
-    def without(self, rows: NDArray[np.bool_], note: str) -> MeasuredTable:
+    def without(self, rows: NDArray[np.bool_], note: str) -> "MeasuredTable":
         """The table without some rows, and why."""
         if not rows.any():
             return self

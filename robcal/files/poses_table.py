@@ -1,7 +1,5 @@
 """poses.csv: one row per pose in the order in which they were driven."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Collection
 from dataclasses import dataclass, field

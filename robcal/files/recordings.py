@@ -1,7 +1,5 @@
 """Recordings from files: the joint log of a robot, and what was measured of it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -4,8 +4,6 @@ Beside the contract's keys a calibrated robot may hold ``terms`` (extra physical
 ``payloads`` and the reference frames ``world_T_base`` and ``flange_T_tool``.
 """
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Annotated, Any, Literal

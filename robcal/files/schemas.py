@@ -3,8 +3,6 @@
 A validation error becomes one sentence that names the file, the line, the entry and the remedy.
 """
 
-from __future__ import annotations
-
 import difflib
 import math
 from pathlib import Path

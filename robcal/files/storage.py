@@ -1,7 +1,5 @@
 """Reading and writing whole files: guarded reading, atomic writing, hashes; operating system errors in plain words."""
 
-from __future__ import annotations
-
 import errno
 import hashlib
 import os

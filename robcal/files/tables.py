@@ -5,8 +5,6 @@ commas, other encodings, missing or doubled columns, rows of another length, tex
 Rows are counted as in an editor: the header is row 1.
 """
 
-from __future__ import annotations
-
 import csv
 import io
 import math

@@ -3,8 +3,6 @@
 Orientation tags are ignored as in other formats: pixels count as they are stored, so that all images of a camera agree.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ Numbers follow YAML 1.2 (``1e-6`` is a number, ``017`` is 17, ``on`` is text, a 
 would turn them into text, octal, booleans and dates.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

@@ -3,8 +3,6 @@
 The centre is the meeting point of the diagonals, which perspective keeps (unlike the mean of the corners).
 """
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray

@@ -1,7 +1,5 @@
 """Shape of single blobs: moments of their pixels, the limits of a dot, the step of grey values across the outline."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2
@@ -38,7 +36,7 @@ class Candidates:
     def __len__(self) -> int:
         return len(self.xy)
 
-    def take(self, chosen: NDArray) -> Candidates:
+    def take(self, chosen: NDArray) -> "Candidates":
         """The chosen rows."""
         return Candidates(
             self.xy[chosen],

@@ -6,8 +6,6 @@ and the strict fit of :mod:`robcal.imaging.detect` refuses them. Extrema of the 
 enough to identify them by geometry; their covariance is stated accordingly.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import cv2

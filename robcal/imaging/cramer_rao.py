@@ -5,8 +5,6 @@ values m is sum (dm/dp)' (dm/dp) / v; the bound of the centre is the upper left 
 "Fundamentals of Statistical Signal Processing: Estimation Theory", sec. 3.9).
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

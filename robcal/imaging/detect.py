@@ -1,7 +1,5 @@
 """Targets of one image: find blobs, fit ellipses, read codes, refuse the rest with a reason."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

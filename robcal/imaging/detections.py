@@ -1,7 +1,5 @@
 """What one image yields: targets in columns, and what was looked at and refused, with the reason."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import IntEnum, StrEnum
 

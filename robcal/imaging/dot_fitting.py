@@ -5,8 +5,6 @@ strong gain gradients are in this image; the second round uses both, leaves out 
 edge model by a Gaussian spot where the dot is not larger than its blur.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -62,11 +60,11 @@ class FittedDots:
     def __len__(self) -> int:
         return len(self.xy)
 
-    def take(self, chosen: NDArray) -> FittedDots:
+    def take(self, chosen: NDArray) -> "FittedDots":
         """The chosen rows."""
         return FittedDots(*(getattr(self, name)[chosen] for name in FittedDots.__dataclass_fields__))
 
-    def replaced(self, rows: NDArray, other: FittedDots) -> FittedDots:
+    def replaced(self, rows: NDArray, other: "FittedDots") -> "FittedDots":
         """A copy with `rows` taken from `other`."""
         columns = {}
         for name in FittedDots.__dataclass_fields__:

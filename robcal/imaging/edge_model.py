@@ -16,8 +16,6 @@ Numerically compared with supersampled blurred ellipses the misfit stays below 0
 bias below 0.005 px while the minor semi-axis exceeds 2 s; for smaller ones :func:`spot` is the better model.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr

@@ -10,8 +10,6 @@ Pixels are in single precision, parameters and their normal equations in double.
 the fit's window.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -53,11 +51,11 @@ class EllipseFits:
     residual: Array
     shading_sigma: Array
 
-    def take(self, chosen: NDArray) -> EllipseFits:
+    def take(self, chosen: NDArray) -> "EllipseFits":
         """The chosen rows."""
         return EllipseFits(*(getattr(self, name)[chosen] for name in EllipseFits.__dataclass_fields__))
 
-    def replaced(self, rows: NDArray, other: EllipseFits) -> EllipseFits:
+    def replaced(self, rows: NDArray, other: "EllipseFits") -> "EllipseFits":
         """A copy with `rows` taken from `other`."""
         columns = {}
         for name in EllipseFits.__dataclass_fields__:
@@ -142,7 +140,7 @@ class _System:
     cost: Array
     residual: Array
 
-    def put(self, rows: NDArray, other: _System, chosen: NDArray[np.bool_]) -> None:
+    def put(self, rows: NDArray, other: "_System", chosen: NDArray[np.bool_]) -> None:
         """The `chosen` rows of another system into `rows`."""
         self.normal[rows], self.right[rows] = other.normal[chosen], other.right[chosen]
         self.cost[rows], self.residual[rows] = other.cost[chosen], other.residual[chosen]

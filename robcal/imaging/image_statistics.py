@@ -1,7 +1,5 @@
 """Statistics of all fitted dots of an image: noise around and inside them, its correlation, and shading."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -5,8 +5,6 @@ High-pass estimate of Immerkaer (1996), "Fast noise variance estimation", Comput
 tiles spread over the image; the median of the quieter ones at each grey level is kept.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -4,8 +4,6 @@ The grey centroid is biased by shading; contours at half height with an ellipse 
 to some hundredths of a pixel.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 from skimage.measure import EllipseModel, find_contours

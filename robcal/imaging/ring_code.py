@@ -6,8 +6,6 @@ counts only if every segment is clearly bright or clearly dark and the whole rin
 that is partly covered or cut yields no code.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -6,8 +6,6 @@ others and its own peak, so that a dot in the gap of a code ring, on a bright pl
 threshold of its own.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Which candidates are dots: what may be part of a code ring, what no dot can be, and what was found twice."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree

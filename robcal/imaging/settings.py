@@ -1,7 +1,5 @@
 """Settings of the target detection, checked when they are made."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

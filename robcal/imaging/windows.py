@@ -3,8 +3,6 @@
 Places count from a pixel near the candidate, so that single precision holds them to a hundred-thousandth of a pixel.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -42,7 +40,7 @@ class Windows:
     radius: Array
     saturated: NDArray[np.bool_]
 
-    def take(self, chosen: NDArray) -> Windows:
+    def take(self, chosen: NDArray) -> "Windows":
         """The chosen rows."""
         if len(chosen) == len(self.index) and np.array_equal(chosen, np.arange(len(chosen))):
             return self
@@ -53,7 +51,7 @@ class Windows:
         """Whether any pixel is saturated."""
         return bool(self.saturated.any())
 
-    def double(self) -> Windows:
+    def double(self) -> "Windows":
         """The same in double precision."""
         wide = {name: getattr(self, name).astype(np.float64) for name in ("x", "y", "u", "v", "value")}
         return replace(self, **wide)

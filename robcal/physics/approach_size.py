@@ -1,7 +1,5 @@
 """A joint that stops short or overshoots in proportion to its last move: controllers, soft belts, creeping grease."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

@@ -4,8 +4,6 @@ Each is a cause like the named causes, with the cause `unknown`, and competes wi
 are the coefficients of radial bumps over the covariate; their common prior makes it a coarse Gaussian process.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The whole library of causes: every module of this package that has `ENTRIES` adds them."""
 
-from __future__ import annotations
-
 import importlib
 import pkgutil
 from collections.abc import Mapping

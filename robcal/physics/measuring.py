@@ -5,8 +5,6 @@ of each parameter, in the coordinates of the observation: metres in the world fo
 twist of the frame (translation first) for frames, metres along the wire for distances.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 

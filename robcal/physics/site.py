@@ -1,14 +1,11 @@
 """Where causes may act on a given robot: its joints, the covariates that were recorded, what is fitted already."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from robcal.physics.cause import DEG, Array, RobotCause
-from robcal.physics.prior_scale import DEFLECTION, LEAST_MOMENT
+from robcal.physics.cause import DEFLECTION, DEG, LEAST_MOMENT, Array, RobotCause
 from robcal.robot.model import RobotModel
 
 ANGLE_OF_AXIS = {"x": "roll", "y": "pitch", "z": "yaw"}

@@ -5,8 +5,6 @@ displacement of a pose's observations per unit of that coordinate, `c = d h` wha
 left after the whole fit, the pose alone says `d'(r + c) / d'd` with the standard deviation `1 / |d|`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 

@@ -1,7 +1,5 @@
 """Which robot is delivered: what the diagnosis added has to earn its place on poses that it was not fitted to."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

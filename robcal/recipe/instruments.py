@@ -1,7 +1,5 @@
 """Several instruments: the robot identified from all of them, and verified by each on its own kept-out poses."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """What is left of the robot in force at the poses that it was identified from, in its three parts."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from robcal.calibration.calibrated import CalibratedRobot

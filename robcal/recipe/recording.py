@@ -1,7 +1,5 @@
 """A recording as the diagnosis takes it, with the errors that all poses share: of the station, of the body."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from robcal.calibration.joint_log import JointLog

@@ -1,7 +1,5 @@
 """What the robot has to say of cameras that moved."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The facts that the verdict on a robot rests on, from what was identified, diagnosed and verified."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

@@ -8,8 +8,6 @@ which inverse kinematics sees the structure of a robot whatever parametrisation 
 Only nominal geometry lives here. Deviations, elasticities and terms are the kernel's business.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -11,8 +11,6 @@ Frames: the controller believes ``world_T_tool = world_T_base K(q) flange_T_tool
 tool frames of the model, deviations included); ``F`` is a flange frame in that base.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
@@ -94,7 +92,7 @@ class Compensation:
     converged: BoolArray = field(repr=False)
     steps: int
 
-    def require(self) -> Compensation:
+    def require(self) -> "Compensation":
         """The same compensation.
 
         Raises

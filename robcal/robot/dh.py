@@ -5,8 +5,6 @@ for nearly parallel axes, usually with d = 0) or ``Rx(alpha) Tx(a) Ry(beta) Rz(t
 sliding joint adds q to d. Both are exactly expressible: what stands behind a joint's turn moves into the frame behind.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -6,8 +6,6 @@ With `g` the gravity, the moment about a line `l` through a frame's origin of al
 near side (gravity) or on the far side (bodies), so each function is a sum of products of sines and cosines.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping
 from functools import lru_cache

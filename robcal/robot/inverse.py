@@ -5,8 +5,6 @@ The inverse is that of the nominal geometry, as the controller has it; the real 
 otherwise; a chain that only adds a linear track under a closed-form arm keeps the track where ``near`` has it.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 
 import numpy as np

@@ -7,8 +7,6 @@ Weakness: a multi-start search finds all branches only with high probability; fo
 continuum of which the one near each start is found.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@ The graph comes from :mod:`robcal.robot.kernel_graph`; here it is compiled to Ca
 fed with numpy arrays without copying.
 """
 
-from __future__ import annotations
-
 import re
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
@@ -45,13 +43,13 @@ class PoseInputs:
     def __len__(self) -> int:
         return len(self.q)
 
-    def subset(self, rows: ArrayLike) -> PoseInputs:
+    def subset(self, rows: ArrayLike) -> "PoseInputs":
         """The poses of the given rows (indices or mask)."""
         chosen = np.asarray(rows)
         chosen = chosen if chosen.dtype == bool else chosen.astype(np.intp)
         return PoseInputs(self.q[chosen], self.load[chosen], {k: v[chosen] for k, v in self.covariates.items()})
 
-    def with_q(self, q: ArrayLike) -> PoseInputs:
+    def with_q(self, q: ArrayLike) -> "PoseInputs":
         """The same poses with other joint angles (n, N)."""
         return PoseInputs(np.ascontiguousarray(q, dtype=float), self.load, self.covariates)
 
@@ -102,7 +100,9 @@ class Kernel:
         self._maps: OrderedDict[tuple[str, int], tuple[Any, Any, Any]] = OrderedDict()
         self.covariates = self.graph().covariates
 
-    def with_references(self, world_T_base: ArrayLike | None = None, flange_T_tool: ArrayLike | None = None) -> Kernel:
+    def with_references(
+        self, world_T_base: ArrayLike | None = None, flange_T_tool: ArrayLike | None = None
+    ) -> "Kernel":
         """The same kernel with other references; shares the compiled graph."""
         other = object.__new__(Kernel)
         other.__dict__.update(self.__dict__)
@@ -112,7 +112,7 @@ class Kernel:
             other.flange_T_tool = np.array(flange_T_tool, dtype=float)
         return other
 
-    def with_model(self, model: RobotModel) -> Kernel:
+    def with_model(self, model: RobotModel) -> "Kernel":
         """The same kernel for a model that differs in the values of parameters and in references only.
 
         Raises

@@ -1,7 +1,5 @@
 """Kernels of models that differ in the values of their parameters only share one compiled graph."""
 
-from __future__ import annotations
-
 from collections import OrderedDict
 from collections.abc import Hashable
 

@@ -10,8 +10,6 @@ Statics 'one_step': moments of the undeflected chain. 'converged': the fixed
 point, unrolled; each round gains the factor elasticity * load, about 1e-2 for soft robots.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import casadi as ca

@@ -11,8 +11,6 @@ Parameter names (deviations from nominal, metres, radians, rad/(N m), kg):
 - ``<term>.<parameter>`` for every extra term.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -177,7 +175,7 @@ class RobotModel:
         known = ", ".join(f.name for f in self.frames)
         raise InvalidInput(f"robot '{self.name}' has no frame '{name}'; it has {known}")
 
-    def with_parameters(self, values: Mapping[str, float]) -> RobotModel:
+    def with_parameters(self, values: Mapping[str, float]) -> "RobotModel":
         """Copy with the named values set, those of terms included; a value of zero removes a deviation."""
         plain = dict(self.parameters)
         of_terms = {full for term in self.terms for full in term.parameter_names}
@@ -188,11 +186,11 @@ class RobotModel:
         )
         return replace(self, parameters={n: v for n, v in plain.items() if v != 0.0}, terms=terms)
 
-    def with_terms(self, terms: Iterable[Term]) -> RobotModel:
+    def with_terms(self, terms: Iterable[Term]) -> "RobotModel":
         """Copy with further terms appended."""
         return replace(self, terms=(*self.terms, *terms))
 
-    def nominal(self) -> RobotModel:
+    def nominal(self) -> "RobotModel":
         """Copy without deviations and terms: what the controller believes."""
         return replace(self, parameters={}, terms=())
 

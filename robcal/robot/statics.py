@@ -11,8 +11,6 @@ symmetric matrix: with ``F_b`` the derivative of the first moment by coordinate 
 over all moments be differentiated in one sweep (:func:`moment_sweep`).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 

@@ -5,8 +5,6 @@ do not. Deviations from the ideal structure up to a millimetre and a milliradian
 solutions found are then refined on the true chain.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

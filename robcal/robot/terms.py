@@ -18,8 +18,6 @@ Names are the term's own parameters (short names) or variables:
 - ``payload_mass`` (kg), ``index`` (row number), and any numeric covariate column by its name.
 """
 
-from __future__ import annotations
-
 import ast
 import math
 import re

@@ -9,8 +9,14 @@ import numpy as np
 import pytest
 
 from robcal.calibration.observations import FrameObservations, Observations, PointObservations
-from robcal.calibration.slips import Slip, empty_readings, find_slips, frozen_readings, outside_limits
-from robcal.calibration.slips.joints import listed
+from robcal.calibration.recording_errors import (
+    RecordingFault,
+    empty_readings,
+    find_faults,
+    frozen_readings,
+    outside_limits,
+)
+from robcal.calibration.recording_errors.joints import listed
 from robcal.robot.kernel import Kernel
 from robcal.robot.model import Frame, RobotModel
 from robcal.transforms import exp_so3, frame, frame_from_xyzrpy, invert, log_so3, rotation_from_rpy, xyzrpy_from_frame
@@ -40,8 +46,10 @@ def _points(frames: FrameObservations, targets: int = 1) -> list[Observations]:
     return [PointObservations(rows, np.tile(on_tool, (n, 1)), p_world.reshape(-1, 3), C, ids)]
 
 
-def _found(s: Scenario, q: np.ndarray, observed: list[Observations], model: RobotModel | None = None) -> list[Slip]:
-    return find_slips(model or s.model, s.poses.with_q(q), observed)
+def _found(
+    s: Scenario, q: np.ndarray, observed: list[Observations], model: RobotModel | None = None
+) -> list[RecordingFault]:
+    return find_faults(model or s.model, s.poses.with_q(q), observed)
 
 
 def _damage(q: np.ndarray, what: str) -> np.ndarray:
@@ -219,9 +227,9 @@ def test_rotation_vectors_transposed_and_inverse(sound: Scenario, measured: Fram
 def test_health_raises_no_suspicion_and_chaos_no_false_slip() -> None:
     s = scenario(12)
     observed = s.frames(s.poses)
-    assert find_slips(s.model, s.poses, [observed]) == []
+    assert find_faults(s.model, s.poses, [observed]) == []
     chaos = s.poses.with_q(s.rng.permutation(s.poses.q))
-    assert find_slips(s.model, chaos, [observed]) == []
+    assert find_faults(s.model, chaos, [observed]) == []
 
 
 def test_blunders_are_no_slip(sound: Scenario, measured: FrameObservations) -> None:

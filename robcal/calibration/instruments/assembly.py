@@ -1,7 +1,5 @@
 """From a solution over all instruments to a robot for each of them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 

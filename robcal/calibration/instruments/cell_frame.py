@@ -4,8 +4,6 @@ Coordinates are x, y, z along the axes of the outer frame and roll, pitch, yaw, 
 known; an end of which nothing is known is perturbed on the right, which has no singular orientation.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

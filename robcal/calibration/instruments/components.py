@@ -4,8 +4,6 @@ Each group's sum of squares is set against its own redundancy and the estimation
 1907 in the simplified form of Foerstner 1979).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 

@@ -5,8 +5,6 @@ world, then of every tool. Rows are poses of instruments: a pose that two instru
 estimation knows of poses holds for several instruments as it does for one.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 

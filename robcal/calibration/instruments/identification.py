@@ -1,7 +1,5 @@
 """Identification of one robot from several instruments: each has a world, a tool and a noise of its own."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """An instrument: what it measured, in which world, of which tool."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 

@@ -1,7 +1,5 @@
 """World and tool of one instrument on a robot that is known: start values, and instruments that only verify."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 

@@ -1,7 +1,5 @@
 """What an identification with several instruments leaves: the robot, and how each instrument stands to it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 

@@ -1,7 +1,5 @@
 """Whitening of what the observations of one pose share: the repeatability of the joints moves them all together."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -64,7 +62,7 @@ class SharedNoise:
             out[rows] = up @ rows_first[rows]
         return out
 
-    def subset(self, keep: Array) -> SharedNoise:
+    def subset(self, keep: Array) -> "SharedNoise":
         """Only the observations of the given indices."""
         return SharedNoise(self.pose[keep], self.moved[keep], self.ratio)
 

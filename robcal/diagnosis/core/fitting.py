@@ -1,7 +1,5 @@
 """A robot fitted to a recording together with the causes that were accepted, linearised where the fit ended."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -9,8 +7,7 @@ import numpy as np
 
 from robcal.diagnosis.core.recording import Recording, observation_data
 from robcal.diagnosis.scan.statistics import orthonormal_basis
-from robcal.physics.cause import Array, Constants, LinearCause, ObservationCause
-from robcal.physics.prior_scale import prior_scales
+from robcal.physics.cause import Array, Constants, LinearCause, ObservationCause, prior_scales
 from robcal.robot.kernel import Kernel, PoseInputs
 from robcal.robot.kernel_cache import kernel_of
 from robcal.robot.model import RobotModel, Term

@@ -1,7 +1,5 @@
 """What a diagnosis works on: poses and what was measured in them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -126,14 +124,14 @@ class Recording:
         """Label of the observation to which each row of the residuals belongs."""
         return np.repeat(np.arange(len(self.observations.pose)), rows // len(self.observations.pose))
 
-    def without_observations(self, drop: Array) -> Recording:
+    def without_observations(self, drop: Array) -> "Recording":
         """Without the observations of the given indices."""
         keep = np.setdiff1d(np.arange(len(self.observations.pose)), drop)
         shared = None if self.shared is None else self.shared.subset(keep)
         common = None if self.common is None else self.common[keep]
         return replace(self, observations=_rows(self.observations, keep), shared=shared, common=common)
 
-    def subset(self, keep: Array) -> Recording:
+    def subset(self, keep: Array) -> "Recording":
         """Only the poses where `keep` (n,) is true; observations of the others are left out."""
         rows = np.flatnonzero(keep)
         number = np.full(len(self.q), -1)

@@ -5,8 +5,6 @@ measurements as they are. Errors come from blocked folds (Roberts et al., 2017):
 together, and so do repeats.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -89,7 +87,7 @@ class Gain:
         """The error falls by more than its own standard error, and in no fold it grows much."""
         return self.before - self.after > self.sigma and self.even
 
-    def pays_beside(self, weighted: Gain) -> bool:
+    def pays_beside(self, weighted: "Gain") -> bool:
         """The error falls, or that weighted by its uncertainty does beyond doubt while this one stays as it is.
 
         Directions and places that are measured best show small effects which the plain length hides in noise.

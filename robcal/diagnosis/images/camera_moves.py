@@ -6,8 +6,6 @@ found. With two cameras only their relative motion shows in images. The robot st
 base seems to jump, so the one that leaves the smaller misfit of the robot has moved.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 

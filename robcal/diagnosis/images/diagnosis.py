@@ -1,7 +1,5 @@
 """Diagnosis of image residuals: detection, naming and gain for surveys and stations, to first order."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 

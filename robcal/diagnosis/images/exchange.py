@@ -1,7 +1,5 @@
 """Targets of a station that carry each other's number, reported by the marks that the orientation had to leave out."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping
 

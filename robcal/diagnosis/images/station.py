@@ -4,8 +4,6 @@ The adjustment takes the body's coordinates and the start values of the lens as 
 "what the unknowns absorb" an orthogonal projection, and only then a displaced target shows in the right size.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Isolated gross errors: one pose or one point whose residuals do not fit, reported apart from physics by evidence."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Noise before physics: the variance components of :mod:`robcal.calibration.noise` at a fit of the diagnosis."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Targets that carry each other's number: found from distances alone, before anything is fitted to them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

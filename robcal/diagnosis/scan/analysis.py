@@ -1,7 +1,5 @@
 """One analysis at one fit: all candidates tested, ranked, and the family-wise probability of the largest."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

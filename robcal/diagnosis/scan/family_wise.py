@@ -6,8 +6,6 @@ probability. The noise has the tails that the residuals show: with long ones, ca
 found by chance far more often.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """From a scan to names: posterior over causes, refinement of constants, rivals."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any

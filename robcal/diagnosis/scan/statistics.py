@@ -7,8 +7,6 @@ whose amplitudes have the prior as standard deviation, averaged over six sizes o
 (1995) for Bayes factors; Baarda (1968), Teunissen (2006) for detection, identification, adaptation.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Whitened tangent columns of causes at a fit: what each cause would do to the residuals."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 

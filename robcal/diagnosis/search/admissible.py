@@ -4,8 +4,6 @@ A cause must be possible by its sign and size; one bound to the time or the orde
 else changes from pose to pose; and it must gain on poses kept out in blocks.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

@@ -6,8 +6,6 @@ Gaussian process with period one turn, and the poses of whole blocks that were k
 true. A curve that a few waves describe as well is left to the causes with a name.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise

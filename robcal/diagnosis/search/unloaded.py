@@ -1,7 +1,5 @@
 """Elasticities of joints that carry no load as the model stands: they matter once a cause brings a load."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 import numpy as np

@@ -3,8 +3,6 @@
 :func:`adjust` takes marks with known identity and approximate values; :mod:`robcal.photogrammetry.survey` finds these.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

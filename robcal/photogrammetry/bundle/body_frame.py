@@ -1,7 +1,5 @@
 """The frame of a surveyed body: fitted onto given coordinates, or centroid and principal directions."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import Enum
 

@@ -6,8 +6,6 @@ engine works with OPENCV (k1, k2, p1, p2) and holds k3 at zero. Covariances are 
 pycolmap are conditional and assume unit weight.
 """
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager

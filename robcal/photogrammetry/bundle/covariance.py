@@ -1,7 +1,5 @@
 """Factorised normal equations and cofactors of a bundle adjustment at given values of its unknowns."""
 
-from __future__ import annotations
-
 from robcal.estimation.schur import Factor
 from robcal.photogrammetry.bundle.normals import Linearised, State, build_normals, linearise
 from robcal.photogrammetry.bundle.solver import Problem

@@ -4,8 +4,6 @@ Images alone leave seven freedoms: shift, turn and scale of body and stations to
 Source: inner constraints (free network) after Granshaw (1980), Photogrammetric Record 10(56):181-207.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """What a network does not determine: unknowns whose effect in the image could be anything, and near-equal unknowns."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -4,8 +4,6 @@ Sources: Huber (1964), Ann. Math. Statist. 35:73-101, for the weights of the sta
 for use in geodetic networks", for the test.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

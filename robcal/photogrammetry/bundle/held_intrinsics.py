@@ -1,7 +1,5 @@
 """Interior orientation that a network does not determine: held at its start values, or an error with the reason."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, NoReturn

@@ -3,8 +3,6 @@
 Check lengths in the manner of VDI/VDE 2634 part 1: length measurement error = measured minus calibrated length.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy import linalg
 

@@ -6,8 +6,6 @@ numbers of every station, which only its own marks see and which are eliminated 
 Stations are perturbed on the right: p_camera = R (Exp(omega) p + rho) + t.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -27,7 +25,7 @@ class State:
     camera_T_body: Array
     points: Array
 
-    def moved(self, basis: Array, reduced: Array, stations: Array) -> State:
+    def moved(self, basis: Array, reduced: Array, stations: Array) -> "State":
         """The state after a step: reduced (a,) = free intrinsics (columns of basis) then points; stations (n, 6)."""
         k = basis.shape[1]
         return State(

@@ -1,7 +1,5 @@
 """A finished network as a linear operator: what its unknowns absorb, for tests of effects the model leaves out."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

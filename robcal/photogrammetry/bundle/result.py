@@ -1,7 +1,5 @@
 """From a converged bundle adjustment to its result: variance components, covariances, reliability, correlations."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

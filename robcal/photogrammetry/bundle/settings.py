@@ -1,7 +1,5 @@
 """How a bundle adjustment is done."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """Reliability of a network's marks: redundancy numbers (Baarda 1968)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

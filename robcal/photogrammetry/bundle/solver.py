@@ -3,8 +3,6 @@
 The problem is what stays fixed during one minimisation; the state is what moves.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,7 +37,7 @@ class Bars:
     sigma: Array
 
     @classmethod
-    def none(cls) -> Bars:
+    def none(cls) -> "Bars":
         """No scale bars."""
         return cls(np.zeros((0, 2), np.int64), np.zeros(0), np.zeros(0))
 

@@ -5,8 +5,6 @@ lengths if none is known; each seed is grown by resection and intersection with 
 that explains the most marks wins.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """The marks still in use during a bundle adjustment, with the values of all images and targets."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 

@@ -1,7 +1,5 @@
 """Measuring bodies: targets with ids, coordinates and their covariance, as carried by the flange or surveyed."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
@@ -87,7 +85,7 @@ class Body:
         found = order[at]
         return np.where(self.ids[found] == wanted, found, -1)
 
-    def select(self, rows: Sequence[int] | IntArray | NDArray[np.bool_]) -> Body:
+    def select(self, rows: Sequence[int] | IntArray | NDArray[np.bool_]) -> "Body":
         """The body reduced to some of its targets (indices or mask), covariance marginalised accordingly."""
         at = np.arange(len(self))[np.asarray(rows)]
         columns = (3 * at[:, None] + np.arange(3)).ravel()

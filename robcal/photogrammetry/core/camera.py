@@ -4,8 +4,6 @@ Pixels are (x, y) with the centre of the top-left pixel at (0, 0). The camera lo
 y down. Source of the model: OpenCV documentation, "Camera Calibration and 3D Reconstruction" (five coefficients).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,7 +37,7 @@ class Camera:
         """The intrinsic parameters (9,) in the order of :data:`INTRINSIC_NAMES`."""
         return np.array([getattr(self, name) for name in INTRINSIC_NAMES], dtype=float)
 
-    def with_vector(self, numbers: ArrayLike) -> Camera:
+    def with_vector(self, numbers: ArrayLike) -> "Camera":
         """The same camera with other intrinsic parameters."""
         values = np.asarray(numbers, dtype=float)
         if values.shape != (9,):
@@ -57,7 +55,7 @@ class Camera:
         return np.array([self.k1, self.k2, self.p1, self.p2, self.k3])
 
     @classmethod
-    def from_size(cls, width: int, height: int, focal_factor: float = 1.2) -> Camera:
+    def from_size(cls, width: int, height: int, focal_factor: float = 1.2) -> "Camera":
         """Start values from the image size alone: centred, no distortion, f = focal_factor * longer side."""
         f = focal_factor * max(width, height)
         return cls(width, height, f, f, (width - 1) / 2, (height - 1) / 2)

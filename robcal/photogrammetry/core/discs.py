@@ -9,8 +9,6 @@ Weaknesses: images from one direction only leave A undetermined; the accuracy of
 percent where dots are well exposed), which is ample for the eccentricity of a projected centre.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -51,7 +49,7 @@ class Discs:
     sigma: Array
     images: IntArray
 
-    def select(self, rows: IntArray) -> Discs:
+    def select(self, rows: IntArray) -> "Discs":
         """The discs of some targets."""
         return Discs(self.diameter[rows], self.normal[rows], self.sigma[rows], self.images[rows])
 

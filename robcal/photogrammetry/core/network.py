@@ -4,8 +4,6 @@ A network is one camera (one interior orientation) seen at ``n`` stations around
 Lengths in metres, angles in radians, image coordinates in pixels with the centre of the top-left pixel at (0, 0).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
@@ -75,7 +73,7 @@ class ImageMarks:
     def __len__(self) -> int:
         return len(self.image)
 
-    def select(self, rows: ArrayLike) -> ImageMarks:
+    def select(self, rows: ArrayLike) -> "ImageMarks":
         """The marks of the given rows (indices or mask)."""
         chosen = np.asarray(rows)
         return replace(
@@ -121,11 +119,11 @@ class Lengths:
         return len(self.ids)
 
     @classmethod
-    def none(cls) -> Lengths:
+    def none(cls) -> "Lengths":
         """No lengths at all."""
         return cls(np.zeros((0, 2), np.int64), np.zeros(0), np.zeros(0))
 
-    def select(self, rows: ArrayLike) -> Lengths:
+    def select(self, rows: ArrayLike) -> "Lengths":
         """The lengths of the given rows (indices or mask)."""
         chosen = np.asarray(rows)
         return Lengths(self.ids[chosen], self.length[chosen], self.sigma[chosen])

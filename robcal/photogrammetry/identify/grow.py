@@ -1,7 +1,5 @@
 """From a rough pose to all dots it explains: match, refine pose, lens, match again."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 

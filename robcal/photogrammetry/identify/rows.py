@@ -5,8 +5,6 @@ stepped plates) is found among a thousand false dots, where triples of dots woul
 a line with slowly changing spacing, which the chains follow by extrapolating their last two steps.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from functools import lru_cache
 from itertools import combinations, pairwise

@@ -5,8 +5,6 @@ hardly produce it (expected number of equally good accidents over all hypotheses
 numbering explains the dots as well: a symmetric arrangement is refused, not guessed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import combinations, permutations

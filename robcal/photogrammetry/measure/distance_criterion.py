@@ -5,8 +5,6 @@ is eliminated that leaves none (a minimum vertex cover, Karp 1972). The toleranc
 what recurs from pose to pose is separated from isolated errors first.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations

@@ -1,7 +1,5 @@
 """Least-squares frames of a body onto measured points, all poses together, with full covariances."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

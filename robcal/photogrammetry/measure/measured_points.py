@@ -1,7 +1,5 @@
 """Measured points and poses of a body: the types between the station (or any other measuring system) and the robot."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +16,22 @@ class RejectedPoint:
     pose: int
     target: int
     reason: str
+
+
+@dataclass(frozen=True)
+class Exchange:
+    """Two targets that carried each other's number in some poses.
+
+    Attributes
+    ----------
+    targets : the two numbers, the smaller first. poses : numbers of the poses.
+    before, after : m, median deviation of the lengths to the other targets as recorded, and with the numbers exchanged.
+    """
+
+    targets: tuple[int, int]
+    poses: tuple[int, ...]
+    before: float
+    after: float
 
 
 @dataclass(frozen=True)
@@ -50,6 +64,7 @@ class MeasuredPoints:
     residual : (m,) root of chi-square by redundancy of the intersection, NaN without redundancy.
     station_jacobian : (m, 3, k) derivative by the station's parameters, station_covariance (k, k); None if not known.
     resected : poses by resection. rejected : points left out, with reason.
+    exchanges : numbers that were exchanged in some poses, and are right here.
     inconsistent_poses : poses in which most rays miss one another: evidence, nothing was left out for it.
     """
 
@@ -64,6 +79,7 @@ class MeasuredPoints:
     resected: ResectedPoses | None = None
     rejected: tuple[RejectedPoint, ...] = ()
     inconsistent_poses: tuple[int, ...] = ()
+    exchanges: tuple[Exchange, ...] = ()
 
     def __post_init__(self) -> None:
         m = len(self.pose)
@@ -81,7 +97,9 @@ class MeasuredPoints:
             raise InvalidInput(f"target {target} is listed more than once in pose {pose}: keep one row")
 
     @classmethod
-    def from_table(cls, pose: Array, target: Array, p_world: Array, covariance: Array | None = None) -> MeasuredPoints:
+    def from_table(
+        cls, pose: Array, target: Array, p_world: Array, covariance: Array | None = None
+    ) -> "MeasuredPoints":
         """Points of any measuring system; ``covariance`` (m, 3, 3) m^2 or None."""
         m = len(pose)
         return cls(

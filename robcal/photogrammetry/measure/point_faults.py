@@ -1,7 +1,5 @@
 """Faults that all measured points have in common: a wrong unit, or coordinates that mirror the body."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from robcal.errors import DegenerateGeometry

@@ -1,7 +1,5 @@
 """From marks to points in the world: forward intersection, and resection where only one camera sees the body."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -13,7 +11,7 @@ from scipy import stats
 from robcal.errors import DegenerateGeometry
 from robcal.photogrammetry.core.bodies import Body, IntArray, spans_plane
 from robcal.photogrammetry.core.camera import project
-from robcal.photogrammetry.core.eccentric_circle import effective_point
+from robcal.photogrammetry.core.eccentricity import effective_point
 from robcal.photogrammetry.measure.measured_points import MeasuredPoints, RejectedPoint, ResectedPoses
 from robcal.photogrammetry.measure.resected_poses import resect_poses
 from robcal.photogrammetry.orientation.intersection import Intersection, intersect
@@ -37,10 +35,10 @@ class _Points:
     def columns(self) -> tuple[Any, ...]:
         return (self.pose, self.target, self.p_world, self.covariance, self.n_cameras, self.residual, self.jacobian)
 
-    def select(self, rows: ArrayLike) -> _Points:
+    def select(self, rows: ArrayLike) -> "_Points":
         return _Points(*(column[np.asarray(rows)] for column in self.columns))
 
-    def joined(self, other: _Points) -> _Points:
+    def joined(self, other: "_Points") -> "_Points":
         return _Points(*(np.concatenate(pair) for pair in zip(self.columns, other.columns, strict=True)))
 
 

@@ -3,8 +3,6 @@
 Evidence for the diagnosis, and the reference against which isolated errors are judged.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Poses of a body by resection, from all its marks at once, where too few targets are seen by two cameras."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy import stats
 

@@ -5,8 +5,6 @@ Three targets define a frame by Gram-Schmidt orthogonalisation (Golub and Van Lo
 instead of each single one, which is the same frame with less noise; further targets are added in that frame.
 """
 
-from __future__ import annotations
-
 from itertools import combinations
 
 import numpy as np

@@ -4,8 +4,6 @@ IPPE for planes (Collins and Bartoli 2014), SQPnP for spatial bodies (Terzakis a
 over many triples where marks may be misidentified (Fischler and Bolles 1981).
 """
 
-from __future__ import annotations
-
 from itertools import combinations
 
 import cv2

@@ -5,8 +5,6 @@ uncertainty of the station (exterior and interior orientation), which moves all 
 a derivative by the station's parameters, so that a user can propagate it through whatever comes next.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

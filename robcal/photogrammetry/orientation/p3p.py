@@ -4,8 +4,6 @@ Source: Grunert's solution in the form of Haralick, Lee, Ottenberg and Nolle (19
 of the three point perspective pose estimation problem"; the distances are then polished by Newton steps.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 

@@ -3,8 +3,6 @@
 Closed-form candidates, refined with Geman-McClure weights in pixels and with distortion; the best by a truncated cost.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -6,8 +6,6 @@ every M_j to be orthogonal and of equal length. Three unknowns (focal length, tw
 and refined. Source: Triggs (1998), "Autocalibration from planar scenes"; Zhang (2000) for the constraints.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2

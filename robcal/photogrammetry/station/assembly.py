@@ -1,7 +1,5 @@
 """From start values of cameras and body poses to the state that the adjustments of a station work on."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

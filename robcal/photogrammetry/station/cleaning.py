@@ -1,8 +1,6 @@
 """From a robust to a clean station: recurring contradictions freed and reported, isolated gross errors left out,
 interior orientation reduced to what the images carry."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

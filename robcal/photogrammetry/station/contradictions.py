@@ -1,7 +1,5 @@
 """Kinds of causes that a station's adjustment finds and frees by itself."""
 
-from __future__ import annotations
-
 from robcal.cause import Kind
 
 CAMERA_MOVED = Kind(

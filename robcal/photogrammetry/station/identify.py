@@ -1,7 +1,5 @@
 """Identification over a whole station: images help one another through the other cameras."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -13,8 +11,7 @@ from robcal.errors import RobcalError
 from robcal.imaging.detections import Detections
 from robcal.photogrammetry.core.bodies import Body, IntArray
 from robcal.photogrammetry.core.camera import Camera
-from robcal.photogrammetry.identify.extension import IdentifiedImage
-from robcal.photogrammetry.identify.prediction import Prediction, predict_dots
+from robcal.photogrammetry.identify.extension import IdentifiedImage, Prediction, predict_dots
 from robcal.photogrammetry.identify.targets import coded_rows, identify_images, identify_targets
 from robcal.photogrammetry.orientation.resection import resect
 from robcal.photogrammetry.station.network import StationMarks, StationOrientation, StationSettings

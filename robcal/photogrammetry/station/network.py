@@ -5,8 +5,6 @@ A station is a set of cameras at rest that watch one body in many poses. Unknown
 recording and, as weighted observations, the body's coordinates.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
@@ -168,7 +166,7 @@ class MarkTable:
     radius: Array
     normals: Array
 
-    def select(self, rows: NDArray[np.bool_]) -> MarkTable:
+    def select(self, rows: NDArray[np.bool_]) -> "MarkTable":
         """The table reduced to some rows."""
         return MarkTable(
             self.camera[rows],

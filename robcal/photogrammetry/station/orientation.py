@@ -1,7 +1,5 @@
 """Orientation of a station: joint adjustment of fixed cameras from a body that was shown to them in many poses."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 

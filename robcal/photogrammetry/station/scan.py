@@ -5,8 +5,6 @@ Each candidate is a few extra unknowns. Their test statistic is the drop of the 
 Source: Baarda (1968), "A testing procedure for use in geodetic networks"; change-point form by cumulative sums.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -5,8 +5,6 @@ Dots at different heights on a plate, or on facets, have coordinates but no know
 of a dot's image cannot be modelled, though in many poses the ellipses show plainly how each dot leans.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 

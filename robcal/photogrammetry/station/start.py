@@ -1,7 +1,5 @@
 """Start values of a station: focal lengths where unknown, resections, relative orientation of the cameras by vote."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations

@@ -1,7 +1,5 @@
 """State of a station while it is being oriented: robust adjustment, noise per camera, freed and dropped parts."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

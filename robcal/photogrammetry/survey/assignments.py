@@ -1,7 +1,5 @@
 """The table of a survey: which target every detection shows, and what is known of targets and images so far."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -41,7 +39,7 @@ class Assignments:
     rejected: tuple[RejectedMark, ...] = ()
 
     @classmethod
-    def of(cls, detections: Collection) -> Assignments:
+    def of(cls, detections: Collection) -> "Assignments":
         """The table of what is identified by codes."""
         t, d, n = len(detections.ids), len(detections.image), len(detections.names)
         return cls(
@@ -71,19 +69,19 @@ class Assignments:
         """Row of each target id."""
         return {int(i): row for row, i in enumerate(self.ids)}
 
-    def assign(self, rows: IntArray, target: IntArray | int) -> Assignments:
+    def assign(self, rows: IntArray, target: IntArray | int) -> "Assignments":
         """The table with detections ``rows`` assigned to target rows (-1: to none)."""
         column = self.target.copy()
         column[rows] = target
         return replace(self, target=column)
 
-    def locate(self, row: int, point: Array) -> Assignments:
+    def locate(self, row: int, point: Array) -> "Assignments":
         """The table with start coordinates of a target."""
         points = self.start_points.copy()
         points[row] = point
         return replace(self, start_points=points)
 
-    def append(self, target_id: int, *, new: bool = False) -> Assignments:
+    def append(self, target_id: int, *, new: bool = False) -> "Assignments":
         """The table with one more target."""
         return replace(
             self,
@@ -92,7 +90,7 @@ class Assignments:
             start_points=np.concatenate([self.start_points, np.full((1, 3), np.nan)]),
         )
 
-    def without_starts(self) -> Assignments:
+    def without_starts(self) -> "Assignments":
         """The table without start values: what the last adjustment left out stays out."""
         return replace(
             self,

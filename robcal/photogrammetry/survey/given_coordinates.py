@@ -1,7 +1,5 @@
 """Given coordinates of a body against its survey: targets that contradict it, and mirror images."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@ Known points are projected with propagated covariance; a detection is taken only
 point that is alone within its reach.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -46,7 +44,7 @@ class Geometry:
     intrinsics_covariance: Array
 
     @classmethod
-    def of(cls, network: CameraNetwork) -> Geometry:
+    def of(cls, network: CameraNetwork) -> "Geometry":
         """Geometry of an adjusted network."""
         t = len(network.points)
         blocks = network.points_covariance.reshape(t, 3, t, 3)[np.arange(t), :, np.arange(t), :]
@@ -59,7 +57,7 @@ class Geometry:
             network.intrinsics_covariance,
         )
 
-    def with_points(self, points: Array, covariance: Array) -> Geometry:
+    def with_points(self, points: Array, covariance: Array) -> "Geometry":
         """The same cameras with more points."""
         return Geometry(
             self.camera,
@@ -70,7 +68,7 @@ class Geometry:
             self.intrinsics_covariance,
         )
 
-    def with_stations(self, camera_T_body: Array, covariance: Array) -> Geometry:
+    def with_stations(self, camera_T_body: Array, covariance: Array) -> "Geometry":
         """The same points with more cameras."""
         return Geometry(
             self.camera,

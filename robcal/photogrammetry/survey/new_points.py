@@ -4,8 +4,6 @@ Hypotheses from pairs of images (rays that meet inside the body's surroundings) 
 support; what stays ambiguous is left out.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Causes of image residuals."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 

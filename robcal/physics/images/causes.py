@@ -3,8 +3,6 @@
 Each gives the displacement (m, 2, q) in px of all marks per unit of its parameters.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

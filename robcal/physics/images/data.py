@@ -1,7 +1,5 @@
 """Image residuals of a survey or station as one linear problem: what its unknowns absorb, geometry of the marks."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 

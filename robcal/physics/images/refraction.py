@@ -1,7 +1,5 @@
 """Refraction in front of a camera: a window of glass, or a boundary to another medium."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

@@ -10,8 +10,6 @@ macros ARM, CLOSED_FORM and INVERSE. Exported is one file: the robot's numbers (
 that this robot needs in the order of their includes.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace

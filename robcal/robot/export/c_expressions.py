@@ -4,8 +4,6 @@ CasADi's own generator brings its calling convention and work arrays along; a co
 operations are taken from the function's instruction list, so every extra term of a model comes with it.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

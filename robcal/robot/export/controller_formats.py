@@ -9,8 +9,6 @@ Weakness: speeds are left at a slow default; sliding joints (a track) become the
 URScript has none.
 """
 
-from __future__ import annotations
-
 import re
 import unicodedata
 from collections.abc import Callable

@@ -5,8 +5,6 @@ are neither read nor written: with a template its visual and collision elements 
 and a calibration does not know (effort, velocity, moments of inertia) gets the assumptions named in the file.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 from xml.etree import ElementTree
@@ -15,8 +13,7 @@ import numpy as np
 
 from robcal.errors import InvalidInput
 from robcal.robot.model import Frame, RobotModel
-from robcal.robot.urdf import model_from_urdf, turn_x_to
-from robcal.robot.urdf_chain import NEGLIGIBLE_MASS, UrdfStep, chain_steps, parse_urdf
+from robcal.robot.urdf_chain import NEGLIGIBLE_MASS, UrdfStep, chain_steps, model_from_urdf, parse_urdf, turn_x_to
 from robcal.transforms import Array, frame, frame_from_xyzrpy, invert, rotation_from_rpy, rpy_from_rotation
 
 EFFORT = 1e5

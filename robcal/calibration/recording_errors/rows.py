@@ -1,7 +1,5 @@
 """Rows of the joint log and of the measurements that do not belong together: shifted, exchanged."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from itertools import combinations
 
@@ -9,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robcal.calibration.observations import FrameObservations
-from robcal.calibration.slips.recorded import Recorded, Trial, best_cell, misses_in
+from robcal.calibration.recording_errors.recorded import Recorded, Trial, best_cell, residuals_in
 from robcal.errors import RobcalError
 from robcal.transforms import difference
 
@@ -54,10 +52,10 @@ def _breaks(recorded: Recorded) -> list[int]:
         return []
     head = np.arange(max(12, n // 3))
     try:
-        misses = misses_in(recorded, *best_cell(recorded.subset(head)))
+        residuals = residuals_in(recorded, *best_cell(recorded.subset(head)))
     except RobcalError:
         return []
-    far = misses > FAR * float(np.nanmedian(misses[head])) + 1e-3
+    far = residuals > FAR * float(np.nanmedian(residuals[head])) + 1e-3
     # the first row after which most rows are far
     for k in range(len(head) // 2, n - 3):
         if far[k] and far[k:].mean() > 0.8:
@@ -74,10 +72,10 @@ def stray_rows(recorded: Recorded) -> Iterator[Trial]:
     if len(frames) != 1 or len(recorded.observations) != 1:
         return
     W, F = best_cell(recorded)
-    misses = misses_in(recorded, W, F)
-    limit = max(LEAST_FAR, FAR * float(np.nanmedian(misses)))
-    far = np.flatnonzero(np.nan_to_num(misses) > limit)
-    if not 2 <= len(far) <= max(MOST_FAR, len(misses) // 4):
+    residuals = residuals_in(recorded, W, F)
+    limit = max(LEAST_FAR, FAR * float(np.nanmedian(residuals)))
+    far = np.flatnonzero(np.nan_to_num(residuals) > limit)
+    if not 2 <= len(far) <= max(MOST_FAR, len(residuals) // 4):
         return
     T = W @ recorded.base_T_flange @ F
     measured = np.full((len(T), 4, 4), np.nan)

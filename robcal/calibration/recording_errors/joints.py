@@ -1,6 +1,4 @@
-"""Slips of the joint log and of the robot file: senses, units, columns, couplings, axes."""
-
-from __future__ import annotations
+"""Faults of the joint log and of the robot file: senses, units, columns, couplings, axes."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -9,7 +7,7 @@ from itertools import combinations, permutations, product
 import numpy as np
 from numpy.typing import NDArray
 
-from robcal.calibration.slips.recorded import Recorded, Trial
+from robcal.calibration.recording_errors.recorded import Recorded, Trial
 
 Array = NDArray[np.float64]
 
@@ -108,9 +106,9 @@ def _axes(recorded: Recorded) -> Iterator[Trial]:
 
 
 def _turned(at: int, axis: str, sign: int) -> Callable[[Recorded], Recorded]:
-    def mend(r: Recorded) -> Recorded:
+    def correct(r: Recorded) -> Recorded:
         frames = list(r.model.frames)
         frames[at] = replace(frames[at], axis=axis, sign=sign)
         return r.with_frames(frames)
 
-    return mend
+    return correct

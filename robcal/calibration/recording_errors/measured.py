@@ -1,6 +1,4 @@
-"""Slips of the measurements: columns, units, mirror images, conventions of orientation."""
-
-from __future__ import annotations
+"""Faults of the measurements: columns, units, mirror images, conventions of orientation."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -17,8 +15,8 @@ from robcal.calibration.observations import (
     PointObservations,
     SensorPointObservations,
 )
-from robcal.calibration.slips.joints import listed
-from robcal.calibration.slips.recorded import Recorded, Trial, as_frames
+from robcal.calibration.recording_errors.joints import listed
+from robcal.calibration.recording_errors.recorded import Recorded, Trial, as_frames
 
 Array = NDArray[np.float64]
 
@@ -66,22 +64,22 @@ def _scaled(factor: float) -> Callable[[Recorded], Recorded]:
 
 
 def _on_points(change: Callable[[Array], Array]) -> Callable[[Recorded], Recorded]:
-    def mend(o: Observations) -> Observations:
+    def correct(o: Observations) -> Observations:
         if isinstance(o, PointObservations):
             return replace(o, p_world=change(o.p_world))
         return replace(o, p_sensor=change(o.p_sensor)) if isinstance(o, SensorPointObservations) else o
 
-    def mended(r: Recorded) -> Recorded:
-        changed = r.change(mend)
+    def corrected(r: Recorded) -> Recorded:
+        changed = r.change(correct)
         return replace(changed, observations=as_frames(changed.observations))
 
-    return mended
+    return corrected
 
 
 def _on_frames(change: Callable[[Array, Array], Array]) -> Callable[[Recorded], Recorded]:
     """``change`` makes frames (m, 4, 4) from places (m, 3) and the angles as they stand in the file (m, 3)."""
 
-    def mend(o: Observations) -> Observations:
+    def correct(o: Observations) -> Observations:
         if not isinstance(o, FrameObservations):
             return o
         angles = o.stated_angles
@@ -89,7 +87,7 @@ def _on_frames(change: Callable[[Array, Array], Array]) -> Callable[[Recorded], 
             angles = tf.rpy_from_rotation(o.world_T_tool[:, :3, :3])
         return replace(o, world_T_tool=change(o.world_T_tool[:, :3, 3], angles))
 
-    return lambda r: r.change(mend)
+    return lambda r: r.change(correct)
 
 
 def _columns() -> Iterator[Trial]:

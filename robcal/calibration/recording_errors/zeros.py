@@ -1,7 +1,5 @@
 """Deviations from the robot file that a robot may have, but larger than robots are off: zeros of joints, lengths."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -9,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize
 
-from robcal.calibration.slips.recorded import Recorded, Slip, miss, rows
+from robcal.calibration.recording_errors.recorded import Recorded, RecordingFault, residual_rms, rows
 
 Array = NDArray[np.float64]
 
@@ -18,14 +16,14 @@ SWEEPS = 4
 FAR = 0.05
 """Residual (m, rad) from which on it pulls no harder: blunders do not decide."""
 PROOF = 0.1
-"""Several numbers are free here: the miss must fall further than by a single slip."""
+"""Several numbers are free here: the residual must fall further than by a single fault."""
 NOTEWORTHY_ANGLE, NOTEWORTHY_LENGTH = np.radians(2.0), 0.02
 """Zeros (rad) and lengths (m) off the file by less than this are what identification is for."""
 
 
 @dataclass(frozen=True)
 class _Deviation:
-    """Start values by name of parameter, the miss (m) with them, and what they say."""
+    """Start values by name of parameter, the residual (m) with them, and what they say."""
 
     kind: str
     values: dict[str, float]
@@ -33,28 +31,28 @@ class _Deviation:
     words: str
 
 
-def deviating(recorded: Recorded, before: float, enough: float) -> list[Slip]:
-    """Zeros of joints, else one length of the robot file, that explain the miss; empty if neither does."""
+def deviating(recorded: Recorded, before: float, enough: float) -> list[RecordingFault]:
+    """Zeros of joints, else one length of the robot file, that explain the residual; empty if neither does."""
     for look in (_zeros, _length):
         found = look(recorded)
         if found.values and found.after < min(PROOF * before, enough):
-            proof = f"mending it lowers the miss of the nominal robot from {1e3 * before:.3g} mm to "
+            proof = f"correcting it lowers the residual of the nominal robot from {1e3 * before:.3g} mm to "
             text = f"{found.words}: {proof}{1e3 * found.after:.3g} mm"
             where = " and ".join(name.split(".")[0] for name in found.values)
             remedy = "correct the robot file, or the joint log, unless the robot is so"
-            return [Slip(found.kind, where, text, remedy, before, found.after, found.values)]
+            return [RecordingFault(found.kind, where, text, remedy, before, found.after, found.values)]
     return []
 
 
 def _zeros(recorded: Recorded) -> _Deviation:
-    """Zeros of rotary joints that lower the miss: by steps of 30 degrees joint by joint, then of any size."""
+    """Zeros of rotary joints that lower the residual: by steps of 30 degrees joint by joint, then of any size."""
     joints = recorded.model.joints
 
     def moved(values: Array) -> Recorded:
         return recorded.with_q(recorded.poses.q + values)
 
     def missed(values: Array) -> float:
-        return miss(moved(values))
+        return residual_rms(moved(values))
 
     zeros = np.zeros(len(joints))
     best = missed(zeros)
@@ -101,7 +99,7 @@ def _polished(make: Callable[[Array], Recorded], start: Array, free: Sequence[in
 
 
 def _length(recorded: Recorded) -> _Deviation:
-    """The one coordinate of a frame of the robot file that lowers the miss most."""
+    """The one coordinate of a frame of the robot file that lowers the residual most."""
     found = []
     for at, f in enumerate(recorded.model.frames):
         for axis in range(3):
@@ -110,7 +108,7 @@ def _length(recorded: Recorded) -> _Deviation:
                 return _longer(recorded, at, axis, float(values[0]))
 
             value = _polished(made, np.zeros(1), [0])
-            found.append((miss(made(value)), f.name, axis, float(value[0]), f.xyz[axis]))
+            found.append((residual_rms(made(value)), f.name, axis, float(value[0]), f.xyz[axis]))
     after, name, axis, deviation, stated = min(found)
     measured, written = 1e3 * (stated + deviation), 1e3 * stated
     words = f"{'xyz'[axis]} of {name} is {measured:.1f} mm by the measurements, {written:.1f} mm in the robot file"

@@ -1,0 +1,63 @@
+"""What all commands share: options, one line for errors on purpose, exit codes, the line for programs."""
+
+import json
+import tempfile
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any, NoReturn
+
+import typer
+
+from pipeline.json_io import plain
+from pipeline.messages import show
+from robcal.errors import RobcalError
+
+Quiet = Annotated[bool, typer.Option("-q", "--quiet", help="Only warnings and errors on standard error.")]
+Json = Annotated[bool, typer.Option("--json", help="One result line for programs on standard output.")]
+Workers = Annotated[int | None, typer.Option("--workers", min=1, max=1024, help="Processes for work on images.")]
+RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder of a finished campaign.")]
+InstrumentName = Annotated[
+    str | None, typer.Option("--instrument", metavar="NAME", help="In the world and with the tool of this instrument.")
+]
+CampaignPath = Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="Campaign folder, or its YAML file.")]
+
+
+@contextmanager
+def answers(command: str, as_json: bool, quiet: bool) -> Iterator[dict[str, Any]]:
+    """Run a command's body; errors on purpose become one line and exit code 1, a mistake of the program too."""
+    answer: dict[str, Any] = {}
+    show(quiet)
+    try:
+        yield answer
+    except typer.Exit:
+        raise
+    except RobcalError as error:
+        _fail(command, as_json, " ".join(str(error).split()))
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename else ""
+        _fail(command, as_json, f"{where}{error.strerror or error}")
+    except MemoryError:
+        _fail(command, as_json, "not enough memory: use smaller images or fewer at once")
+    except Exception as error:
+        with tempfile.NamedTemporaryFile(
+            "w", prefix="robcal-", suffix=".log", delete=False, encoding="utf-8", errors="backslashreplace"
+        ) as stream:
+            stream.write(traceback.format_exc())
+        _fail(command, as_json, f"internal error ({type(error).__name__}): the traceback is in {stream.name}")
+    if as_json:
+        typer.echo(json.dumps(plain({"ok": True, "command": command, **answer})))
+
+
+def _fail(command: str, as_json: bool, sentence: str) -> None:
+    typer.echo(f"error: {sentence}", err=True)
+    if as_json:
+        typer.echo(json.dumps({"ok": False, "command": command, "error": sentence}))
+    raise typer.Exit(1)
+
+
+def wrong_use(sentence: str) -> NoReturn:
+    """Say what is wrong with the use of a command and end with exit code 2."""
+    typer.echo(f"wrong use: {sentence}", err=True)
+    raise typer.Exit(2)
