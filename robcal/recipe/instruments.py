@@ -11,7 +11,7 @@ from robcal.calibration.identifiability import repetitions
 from robcal.calibration.identification import IdentifyOptions
 from robcal.calibration.instruments import IdentifiedInstruments, Instrument, identify_instruments
 from robcal.calibration.joint_log import JointLog
-from robcal.calibration.recording_faults import check_joint_log
+from robcal.calibration.recording_errors.search import check_joint_log
 from robcal.calibration.verification import ErrorStatistics, Verification, fit_nominal, verify
 from robcal.errors import InvalidInput
 from robcal.recipe.identification import Identification
