@@ -86,7 +86,7 @@ def test_slip_of_the_log_is_named(sound: Scenario, measured: FrameObservations, 
     slips = _found(sound, _damage(sound.poses.q, what), observed)
     assert (slips[0].kind, slips[0].where) == EXPECTED[what]
     assert slips[0].rms_after < 0.25 * slips[0].rms_before
-    assert "mending" in slips[0].statement
+    assert "correcting" in slips[0].statement
     assert len(slips) == 1
 
 
