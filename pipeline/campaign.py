@@ -109,11 +109,6 @@ class Campaign:
             return self.entry.body
         return next(iter(self.bodies)) if len(self.bodies) == 1 else None
 
-    @property
-    def has_images(self) -> bool:
-        """Whether any image file has to be searched for targets."""
-        return any(source.images for source in all_sources(self))
-
     def measured(self, kind: str) -> tuple[MeasuredTable, ...]:
         """Tables of one kind."""
         return tuple(table for table in self.measurements if table.kind == kind)
