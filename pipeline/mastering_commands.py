@@ -42,3 +42,47 @@ def master_robot(
             LOG.warning(sentence)
         for axis, offset in answer["offsets_deg"].items():
             LOG.info(f"{axis}: {offset:+.5f} +- {answer['sigma_deg'][axis]:.5f} deg")
+
+
+@mastering.command("exchange", short_help="A new robot in place of a calibrated reference robot.")
+def exchange_robot(
+    reference: Annotated[Path, typer.Argument(metavar="REFERENCE_RUN", help="Run of the calibrated reference robot.")],
+    campaign: Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="Some measured poses of the new robot.")],
+    out: Annotated[Path, typer.Option("--out", help="Run folder of the new robot.")],
+    workers: Workers = None,
+    quiet: Quiet = False,
+    as_json: Json = False,
+) -> None:
+    """Identify a new robot so that it goes, in the same world, where the reference robot goes."""
+    with answers("exchange", as_json, quiet) as answer:
+        from pipeline.exchange import exchange_robot as work
+
+        answer.update(work(reference, campaign, out, workers))
+        for sentence in answer["warnings"]:
+            LOG.warning(sentence)
+        LOG.info(f"{answer['parameters']} parameters from {answer['poses']} poses in {out}")
+
+
+@mastering.command(short_help="Taught poses for the new robot.")
+def transfer(
+    new: Annotated[Path, typer.Argument(metavar="NEW_RUN", help="Run of the new robot, from `exchange` or `run`.")],
+    reference: Annotated[Path, typer.Option("--from", metavar="REFERENCE_RUN", help="Run of the reference robot.")],
+    poses: Annotated[Path, typer.Option("--poses", help="Taught poses of the reference: pose, q1_deg, ...")],
+    out: Annotated[Path, typer.Option("--out", help="Table of joint angles to write.")],
+    skip: Annotated[
+        bool, typer.Option("--skip-unreachable", help="Leave out poses beyond the new robot's reach.")
+    ] = False,
+    quiet: Quiet = False,
+    as_json: Json = False,
+) -> None:
+    """Find joint angles that bring the new robot's tool where the reference's tool was."""
+    with answers("transfer", as_json, quiet) as answer:
+        from pipeline.exchange import transfer_poses
+
+        answer.update(transfer_poses(new, reference, poses, out, skip))
+        for sentence in answer["warnings"]:
+            LOG.warning(sentence)
+        LOG.info(
+            f"{answer['poses']} poses in {out}: the tools would have been {answer['untransferred_mean_mm']:.3g} mm "
+            f"apart, now {answer['sigma_mean_mm']:.3g} mm (standard deviation)"
+        )

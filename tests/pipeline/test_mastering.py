@@ -22,7 +22,7 @@ from robcal.calibration.observations import FrameObservations
 from robcal.cell.mastering import master
 from robcal.files.tables import read_table
 from robcal.files.tables import write_table as write_csv
-from tests.pipeline.conftest import edit_yaml
+from tests.pipeline.conftest import edit_rows, edit_yaml
 
 OFFSETS = np.radians([0.4, -0.3, 0.25, 1.2, -0.8, 2.0])
 AXES = [f"axis{k}" for k in range(1, 7)]
@@ -160,6 +160,49 @@ def test_notch(tmp_path: Path) -> None:
     assert re.search("signal.csv: the (notch lies at the edge|signal shows no)", call("--notch", path)["error"])
     path.write_text("q,signal\n1,2\n")
     assert "row 1: column 'q_deg' is missing" in call("--notch", path)["error"]
+
+
+def run_command(*arguments: object) -> dict:
+    result = runner.invoke(app, [*map(str, arguments), "--json"])
+    answer = json.loads(result.stdout)
+    assert result.exit_code == (0 if answer["ok"] else 1), answer
+    return answer
+
+
+def test_exchange_and_transfer(by_frames: tuple[Path, Path, Truth], tmp_path: Path) -> None:
+    """The new robot is the old one with other zeros."""
+    _, run, truth = by_frames
+    every = truth.recorded.q
+    new = recorded(by_frames, tmp_path / "c", every[:12])
+    told = run_command("exchange", run, new, "--out", tmp_path / "new")
+    assert told["poses"] == 12
+    assert set(told["offsets_deg"]) >= {"axis2", "axis3", "axis4", "axis5"}
+    write_csv(tmp_path / "taught.csv", {"pose": list(map(str, range(30))), **joint_columns(every[20:50])})
+    answer = run_command(
+        "transfer", tmp_path / "new", "--from", run, "--poses", tmp_path / "taught.csv", "--out", tmp_path / "q.csv"
+    )
+    table = read_table(tmp_path / "q.csv")
+    q = np.radians(np.column_stack([table.numbers(f"q{k}_deg") for k in range(1, 7)]))
+    wanted = truth.robot.world_T_tool(every[20:50])
+    after = np.linalg.norm((truth.robot.world_T_tool(q + OFFSETS) - wanted)[:, :3, 3], axis=1)
+    before = np.linalg.norm((truth.robot.world_T_tool(every[20:50] + OFFSETS) - wanted)[:, :3, 3], axis=1)
+    assert after.mean() < 0.05 * before.mean()
+    assert answer["untransferred_mean_mm"] == pytest.approx(1e3 * before.mean(), rel=0.05)
+    assert np.sqrt(np.mean((1e3 * after / table.numbers("sigma_mm")) ** 2)) < 2.0
+    edit_rows(tmp_path / "taught.csv", lambda rows: rows[3].update(q2_deg="x"))
+    answer = run_command("transfer", tmp_path / "new", "--from", run, "--poses", tmp_path / "taught.csv", "--out", "q")
+    assert "taught.csv, row 5: q2_deg" in answer["error"]
+
+
+def test_bad_exchanges(by_frames: tuple[Path, Path, Truth], tmp_path: Path) -> None:
+    campaign, run, truth = by_frames
+    two = recorded(by_frames, tmp_path / "two", truth.recorded.q[:1])
+    assert "poses are alike: nothing" in run_command("exchange", run, two, "--out", tmp_path / "o1")["error"]
+    other = recorded(by_frames, tmp_path / "other", truth.recorded.q[:12])
+    edit_yaml(other / "robot.yaml", lambda d: d["frames"][2].update(xyz_mm=[1300.0, 0.0, 0.0]))
+    told = run_command("exchange", run, other, "--out", tmp_path / "o2")
+    assert "is of another type than the reference" in told["error"]
+    assert "is not a run folder" in run_command("exchange", campaign, other, "--out", tmp_path / "o3")["error"]
 
 
 def test_bad_input_is_one_sentence(by_frames: tuple[Path, Path, Truth], tmp_path: Path) -> None:
