@@ -17,13 +17,18 @@ MEASURING = ("camera", "wire", "sensor")
 """Stages whose causes displace what is measured; those of the body are judged by the frames already."""
 
 
-def corrected(recording: RobotRecording, log: JointLog, diagnosis: Diagnosis) -> RobotRecording | None:
+def corrected(
+    recording: RobotRecording, log: JointLog, diagnosis: Diagnosis, moves: bool = True
+) -> RobotRecording | None:
     """The recording without the displacements found in the measuring system; None where there are none.
 
+    ``moves`` : whether those that follow the order of the poses are still in it.
     Weakness: displaced targets of a body and exchanged ids are not corrected in frames.
     """
     found = [
-        (f, f.cause) for f in diagnosis.findings if isinstance(f.cause, ObservationCause) and f.cause.stage in MEASURING
+        (f, f.cause)
+        for f in diagnosis.findings
+        if isinstance(f.cause, ObservationCause) and f.cause.stage in MEASURING and (moves or not f.cause.of_order)
     ]
     if not found:
         return None
