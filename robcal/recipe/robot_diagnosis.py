@@ -162,6 +162,7 @@ def robot_in_force(
     if recording.own_station and final.common is not None:
         known = fit(final.model, replace(noise.apply(recording), common=None), form.free, form.direct, iterations=0)
         relative = known.covariance[:p, :p] * final.variance_factor
+        _, relative = covariance_without_order(final.model, final.free, relative)
     put = placed(found.recording, log, final)
     names, covariance = covariance_without_order(
         final.model, final.free, final.covariance[:p, :p] * final.variance_factor

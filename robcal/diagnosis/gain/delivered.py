@@ -72,6 +72,14 @@ class Delivery:
         residual, jacobian = replace(self.recording, common=None, shared=None).linearise(frames, J)
         return frames, residual, jacobian
 
+    @cached_property
+    def _compressed(self) -> dict[int, Array]:
+        """By fold, the triangular factor of Jacobian and residual of all others: every subset of columns has its least
+        squares solution in it."""
+        fold_of_row = self.labels[self.fitted.row_pose]
+        rows = np.column_stack([self.fitted.jacobian, self.fitted.residual])
+        return {int(k): np.asarray(np.linalg.qr(rows[fold_of_row != k], mode="r")) for k in np.unique(self.labels)}
+
     def vectors(self, dropped: Sequence[str] = ()) -> tuple[Array, Array]:
         """Errors (m_obs, k), m and rad, and whitened ones; without the amplitudes ``dropped``, to first order."""
         fitted, labels = self.fitted, self.labels
@@ -80,12 +88,11 @@ class Delivery:
         out = np.isin(np.array(fitted.free), list(dropped))
         value = fitted.theta[[fitted.kernel.index[name] for name in fitted.free]] * out
         # a term is left out by an amplitude of zero: in small effects the fit is linear
-        at_fit = fitted.residual + fitted.jacobian[:, :count] @ value
         residual = residual + jacobian @ value
         stay = np.concatenate([~out, np.ones(fitted.jacobian.shape[1] - count, dtype=bool)])
         kept = ~np.any(fitted.prior[:, :count][:, out] != 0.0, axis=1)
         prior, expected = fitted.prior[kept][:, stay], fitted.prior_residual[kept]
-        design, jacobian = fitted.jacobian[:, stay], jacobian[:, ~out]
+        jacobian = jacobian[:, ~out]
         cell = [f"{end}.{kind}" for end in ("base", "tool") for kind in GEOMETRIC_KINDS]
         own = [k for k, name in enumerate(np.array(fitted.free)[~out]) if name in cell]
         displaced = fitted.jacobian[:, count:]
@@ -95,7 +102,9 @@ class Delivery:
         left = np.empty(len(residual))
         for fold in np.unique(labels):
             test = fold_of_row == fold
-            step = solve(np.vstack([design[~test], prior]), np.concatenate([at_fit[~test], expected]))
+            rows = self._compressed[int(fold)]
+            at_fit = rows[:, -1] + rows[:, :count] @ value
+            step = solve(np.vstack([rows[:, :-1][:, stay], prior]), np.concatenate([at_fit, expected]))
             after = residual - jacobian @ step[: jacobian.shape[1]]
             if self.freed:
                 after = after - displaced @ (amplitudes + step[jacobian.shape[1] :])
