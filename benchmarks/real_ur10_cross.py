@@ -25,7 +25,7 @@ from robcal.calibration.observations import FrameObservations
 from robcal.calibration.verification import fit_nominal
 from robcal.diagnosis.core.fitting import Accepted
 from robcal.diagnosis.search.curves import likenesses
-from robcal.physics.empirical import CURVE_PRIOR, periodic_curve
+from robcal.physics.angle_error_curve import CURVE_PRIOR, periodic_curve
 from robcal.physics.site import Joint
 from robcal.robot.kernel import Kernel
 from robcal.robot.model import RobotModel

@@ -9,7 +9,9 @@ from typing import Annotated, Any
 
 import typer
 
+from pipeline.cell_commands import cell
 from pipeline.command_line import CampaignPath, Json, Quiet, RunFolder, Workers, answers, wrong_use
+from pipeline.mastering_commands import mastering
 from pipeline.messages import LOG
 
 app = typer.Typer(
@@ -20,6 +22,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="From photographs to an accurate robot: survey, measurement, identification, diagnosis, compensation.",
 )
+app.add_typer(cell, name="cell")
+app.add_typer(mastering)
 
 
 def _check_stages(start: str | None, until: str | None) -> None:

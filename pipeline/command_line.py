@@ -6,7 +6,7 @@ import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NoReturn
 
 import typer
 
@@ -54,7 +54,7 @@ def _fail(command: str, as_json: bool, sentence: str) -> None:
     raise typer.Exit(1)
 
 
-def wrong_use(sentence: str) -> None:
+def wrong_use(sentence: str) -> NoReturn:
     """Say what is wrong with the use of a command and end with exit code 2."""
     typer.echo(f"wrong use: {sentence}", err=True)
     raise typer.Exit(2)

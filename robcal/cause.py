@@ -24,6 +24,7 @@ class Kind:
     of_order : bound to the order or the time of the poses: it says nothing of other poses.
     several_drivers : a place may have it several times, once for each covariate.
     intrinsics : numbers of a camera that a file leaves out.
+    expected : every robot has it, so it takes no place among the few causes that a search may add.
     """
 
     name: str
@@ -38,6 +39,7 @@ class Kind:
     of_order: bool = False
     several_drivers: bool = False
     intrinsics: tuple[str, ...] = ()
+    expected: bool = False
 
     def describe(self, where: str, reported: Mapping[str, object], direction: str | None = None) -> str:
         """The sentence for one place and its reported parameters."""

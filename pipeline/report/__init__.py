@@ -4,8 +4,7 @@ from pathlib import Path
 
 from pipeline.report.chapters import all_chapters
 from pipeline.report.material import Material
-from pipeline.report.page import render
-from pipeline.report.provenance import provenance
+from pipeline.report.page import provenance, render
 from pipeline.report.verdict import verdict_of
 from pipeline.runs import Run
 from robcal.files.storage import write_text

@@ -91,12 +91,13 @@ Block = Text | Bullets | Table | Figure | Pictures
 
 @dataclass(frozen=True)
 class Chapter:
-    """A chapter; it is left out where it has no blocks."""
+    """A chapter; it is left out where it has no blocks. One of the appendix holds evidence, not results."""
 
     anchor: str
     title: str
     lead: str
     blocks: tuple[Block, ...]
+    appendix: bool = False
 
 
 @dataclass(frozen=True)

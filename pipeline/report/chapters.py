@@ -1,6 +1,7 @@
 """The chapters of the report in their order."""
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 from pipeline.report.blocks import Chapter
 from pipeline.report.diagnosis_chapter import diagnosis_chapter
@@ -12,20 +13,23 @@ from pipeline.report.parameter_chapter import parameter_chapter
 from pipeline.report.survey_chapters import network_chapter, survey_chapter
 from pipeline.report.verification_chapter import verification_chapter
 
-_CHAPTERS: tuple[Callable[[Material], Chapter], ...] = (
+_RESULTS: tuple[Callable[[Material], Chapter], ...] = (
     verification_chapter,
     diagnosis_chapter,
+    rejected_chapter,
+    files_chapter,
+)
+_APPENDIX: tuple[Callable[[Material], Chapter], ...] = (
     parameter_chapter,
     measurement_chapter,
     survey_chapter,
     network_chapter,
     image_chapter,
     residual_chapter,
-    rejected_chapter,
-    files_chapter,
 )
 
 
 def all_chapters(material: Material) -> Iterator[Chapter]:
-    """Chapters with whatever the run holds; those without blocks are to be left out."""
-    return (make(material) for make in _CHAPTERS)
+    """Results first, then the evidence as an appendix; chapters without blocks are to be left out."""
+    yield from (make(material) for make in _RESULTS)
+    yield from (replace(make(material), appendix=True) for make in _APPENDIX)

@@ -13,12 +13,13 @@ from pipeline.messages import LOG
 from pipeline.stages.base import Context, Outcome, Stage, no_files
 from pipeline.stages.identify import options_of
 from pipeline.stages.survey import located
-from robcal.diagnosis.content import diagnosis_content, with_images
+from robcal.diagnosis.content import diagnosis_content, with_exchanges, with_images
 from robcal.diagnosis.core.result import Diagnosis
 from robcal.diagnosis.images.diagnosis import ImageFinding
 from robcal.diagnosis.search.selection import SelectionSettings
 from robcal.errors import InvalidInput
 from robcal.files.tables import write_table
+from robcal.photogrammetry.station.contradictions import TARGET_SWAPPED
 from robcal.recipe.robot_diagnosis import Measured, RobotDiagnosis, diagnose_robot
 from robcal.recipe.robot_witness import with_station_moves
 from robcal.recipe.verification import kept_out_gain
@@ -53,6 +54,8 @@ def work(context: Context) -> Outcome:
         raise located(error, str(campaign.poses.path)) from None
     gain = {"before": 1e3 * before, "after": 1e3 * delivered.delivered.tools["0"].rms}
     content = content | _in_force(found) | {"heldout_mm": {**_table(content["heldout_mm"]), **gain}}
+    exchanges = measured.points.exchanges if measured.points is not None else ()
+    content = with_exchanges(content, exchanges, campaign.poses.names)
     write_json(run.diagnosis, content)
     outputs = [run.diagnosis, run.save(artifacts.CALIBRATED, found.robot), run.save(artifacts.EVIDENCE, found.evidence)]
     outputs.append(run.save(artifacts.DELIVERED, delivered))
@@ -66,12 +69,14 @@ def work(context: Context) -> Outcome:
     if found.placed is not None:
         outputs.append(run.save(artifacts.PLACED, found.placed))
     told = [f.statement for f in images.findings] + [f.statement for f in diagnosis.findings]
+    told = [f"targets {x.targets[0]} and {x.targets[1]} exchanged in {len(x.poses)} pose(s)" for x in exchanges] + told
     notes = told or ["nothing missing: the model explains the data"]
     if diagnosis.findings:
         notes = [*notes, found.in_force.reason]
-    outcome = _result(diagnosis) | {"mismatch": content["mismatch"], "heldout_mm": content["heldout_mm"]}
+    outcome = _result(diagnosis) | {key: content[key] for key in ("mismatch", "p_value", "heldout_mm")}
     outcome |= _in_force(found)
-    outcome["causes"] = [*_named(images.findings), *_result(diagnosis)["causes"]]
+    swapped = [{"cause": TARGET_SWAPPED.name, "where": str(x.targets[0]), "direction": None} for x in exchanges]
+    outcome["causes"] = [*swapped, *_named(images.findings), *_result(diagnosis)["causes"]]
     return Outcome({"diagnosis": outcome}, outputs, notes)
 
 

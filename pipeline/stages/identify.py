@@ -14,8 +14,8 @@ from pipeline.stages.survey import located
 from robcal.calibration.calibrated import CalibratedRobot
 from robcal.calibration.identification import IdentifiedRobot, IdentifyOptions
 from robcal.calibration.measurements import RobotRecording, Rows
-from robcal.calibration.recording_faults import fault_of
-from robcal.calibration.slips import mirror_misses
+from robcal.calibration.recording_errors import mirror_residuals
+from robcal.calibration.recording_errors.search import fault_of
 from robcal.errors import InvalidInput, RobcalError
 from robcal.files.poses_table import Poses
 from robcal.files.robot_file import write_robot
@@ -73,7 +73,7 @@ def _check_mirror_image(campaign: Campaign, run: Run, recording: RobotRecording)
         return
     robot, poses = require_robot(campaign)
     words = GivenCoordinates(mirrored=tuple(1e-3 * value for value in entry["mirrored_mm"])).mirror_words
-    straight, mirrored = mirror_misses(robot, poses.inputs(Kernel(robot)), recording.observations)
+    straight, mirrored = mirror_residuals(robot, poses.inputs(Kernel(robot)), recording.observations)
     proof = f"the robot misses the frames by {1e3 * straight:.3g} mm, their mirror images by {1e3 * mirrored:.3g} mm"
     survey = campaign.bodies[name].survey
     marks = survey.marks.path if survey is not None and survey.marks is not None else campaign.path

@@ -3,6 +3,7 @@
 import numpy as np
 
 from pipeline.artifacts import POINTS
+from pipeline.bodies import surveyed_or_given
 from pipeline.campaign import Campaign
 from pipeline.runs import Run
 from pipeline.stages.base import Context, Outcome, Stage
@@ -10,6 +11,7 @@ from pipeline.stages.orient import station_points
 from robcal.errors import InvalidInput
 from robcal.files.poses_table import Poses
 from robcal.files.tables import write_table
+from robcal.photogrammetry.measure.exchanged import exchanged_back, find_exchanges
 from robcal.photogrammetry.measure.measured_points import MeasuredPoints
 
 NAME = "measure"
@@ -25,14 +27,27 @@ def work(context: Context) -> Outcome:
     campaign, run = context.campaign, context.run
     if campaign.poses is None:
         raise InvalidInput(f"{campaign.path}: no poses: add 'poses: poses.csv'")
-    points = station_points(run) if campaign.entry.station is not None else points_from_tables(campaign)
+    points = station_points(run) if campaign.entry.station is not None else _right_numbers(campaign, run)
     write_points(run, campaign.poses, points)
     names = campaign.poses.names
     notes = [f"pose '{names[p]}': the rays of the cameras contradict one another" for p in points.inconsistent_poses]
     if points.resected is not None and len(points.resected.pose):
         notes.append(f"{len(points.resected.pose)} poses by resection from one camera")
+    notes += [
+        f"targets {x.targets[0]} and {x.targets[1]} carry each other's number in {len(x.poses)} pose(s) "
+        f"({', '.join(names[p] for p in x.poses[:6])}{' ...' if len(x.poses) > 6 else ''}): lengths on the body "
+        f"miss by {1000 * x.before:.3g} mm, exchanged by {1000 * x.after:.2g} mm; used exchanged: correct the table"
+        for x in points.exchanges
+    ]
     result = {"measured": len(points.pose), "rejected": len(points.rejected)}
     return Outcome({"points": result}, [run.save(POINTS, points), run.points], notes)
+
+
+def _right_numbers(campaign: Campaign, run: Run) -> MeasuredPoints:
+    points, name = points_from_tables(campaign), campaign.carried_body
+    if name is None:
+        return points
+    return exchanged_back(points, find_exchanges(points, surveyed_or_given(campaign, run, name)))
 
 
 def points_from_tables(campaign: Campaign) -> MeasuredPoints:
@@ -76,7 +91,10 @@ STAGE = Stage(
     name=NAME,
     applies=applies,
     work=work,
-    inputs=lambda campaign: [table.path for table in campaign.measured("points")],
+    inputs=lambda campaign: [
+        *(table.path for table in campaign.measured("points")),
+        *(body.file.path for body in campaign.bodies.values()),
+    ],
     settings=lambda campaign: [list(campaign.poses.names) if campaign.poses else [], campaign.entry.measurements],
     after=("detect", "survey", "orient"),
     module=__name__,

@@ -81,9 +81,9 @@ def work(context: Context) -> Outcome:
 
 def _approach_note(found: RobotVerification) -> list[str]:
     """What stating approach directions would gain."""
-    if found.recorded is None:
+    if found.unstated is None or found.recorded is None:
         return []
-    before, after = (1e3 * v.tools["0"].rms for v in (found.delivered, found.recorded))
+    before, after = (1e3 * v.tools["0"].rms for v in (found.unstated, found.recorded))
     if after > PAYS * before:
         return []
     return [f"state approach: {before:.3f} -> {after:.3f} mm RMS at the kept-out poses"]

@@ -57,7 +57,7 @@ class IdentifyOptions:
     joint_sigma: float | Sequence[float] | None = None
     priors: Mapping[str, float] = field(default_factory=dict)
     covariance: Literal["auto", "stated", "estimated"] = "auto"
-    termination: TerminationSettings = field(default_factory=lambda: TerminationSettings(negligible=1e-4))
+    termination: TerminationSettings = field(default_factory=lambda: TerminationSettings(60, negligible=1e-4))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,9 +13,8 @@ from robcal.calibration.observations import (
     SensorPointObservations,
 )
 from robcal.photogrammetry.core.bodies import Body
-from robcal.photogrammetry.measure.frames import MeasuredFrames
+from robcal.photogrammetry.measure.frames import MeasuredFrames, unabsorbed_covariance
 from robcal.photogrammetry.measure.measured_points import MeasuredPoints
-from robcal.photogrammetry.measure.shared_errors import unabsorbed_covariance
 from robcal.transforms import Array, transform
 
 Rows = NDArray[np.int64]

@@ -16,14 +16,17 @@ from robcal.calibration.identifiability import choose_candidates, plausible_limi
 from robcal.calibration.pose_candidates import Candidates, Cell, find_candidates
 from robcal.calibration.pose_choice import (
     Design,
+    balanced_approaches,
     choose_d_optimal,
     choose_worst_case,
     covariance_of,
     exchange,
+    joint_ranges,
+    path_length,
     predicted_errors,
+    short_order,
     spread,
 )
-from robcal.calibration.pose_order import balanced_approaches, joint_ranges, path_length, short_order
 from robcal.calibration.visibility import frame_information
 from robcal.errors import InvalidInput
 from robcal.robot.chain import chain_of

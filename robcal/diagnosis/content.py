@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from robcal.diagnosis.core.result import Diagnosis, Finding
 from robcal.diagnosis.images.diagnosis import ImageDiagnosis, ImageFinding
 from robcal.diagnosis.next_poses import poses_table
+from robcal.photogrammetry.measure.measured_points import Exchange
+from robcal.photogrammetry.station.contradictions import TARGET_SWAPPED
 from robcal.physics.library import kinds
 
 
@@ -81,6 +83,51 @@ def _cause(finding: Finding) -> dict[str, object]:
         "poses": list(finding.poses),
         "heldout_mm": {"before": number(finding.heldout[0] * 1e3), "after": number(finding.heldout[1] * 1e3)},
         "statement": finding.statement,
+    }
+
+
+def with_exchanges(
+    content: dict[str, object], exchanges: Sequence[Exchange], names: Sequence[str]
+) -> dict[str, object]:
+    """The content of diagnosis.json with targets that carried each other's number in some poses, first of its causes.
+
+    ``names`` of all poses. The test is that of signs: every length fits the exchanged numbers better than its own,
+    which chance does in half of them; four lengths a pose at least were judged. What the robot gains is not counted:
+    the points were used with their right numbers from the start.
+    """
+    if not exchanges:
+        return content
+    causes = [_exchange_cause(x, [names[p] for p in x.poses]) for x in exchanges]
+    statement = "; ".join(str(cause["statement"]) for cause in causes)
+    rest = f"; {content['statement']}" if content["causes"] else ""
+    first = causes[0]
+    location = {key: first[key] for key in ("stage", "where", "direction", "poses")}
+    return content | {
+        "mismatch": True,
+        "p_value": first["p_value"],
+        "location": content["location"] or location,
+        "statement": statement + rest,
+        "causes": [*causes, *_listed(content["causes"])],
+    }
+
+
+def _exchange_cause(exchange: Exchange, poses: list[str]) -> dict[str, object]:
+    where, other = (str(t) for t in exchange.targets)
+    return {
+        "cause": TARGET_SWAPPED.name,
+        "stage": TARGET_SWAPPED.stage,
+        "where": where,
+        "direction": None,
+        "parameters": {"with": exchange.targets[1]},
+        "sigma": {},
+        "p_value": 0.5 ** (4 * len(poses)),
+        "log_evidence": None,
+        "indistinguishable_from": [],
+        "explained": None,
+        "poses": poses,
+        "heldout_mm": {"before": None, "after": None},
+        "statement": f"targets {where} and {other} carry each other's number in {len(poses)} pose(s): lengths on the "
+        f"body miss by {1e3 * exchange.before:.3g} mm as recorded, by {1e3 * exchange.after:.2g} mm exchanged",
     }
 
 

@@ -10,8 +10,7 @@ from robcal.diagnosis.core.fitting import Fit, fit
 from robcal.diagnosis.core.recording import Recording
 from robcal.diagnosis.core.result import Diagnosis, Finding
 from robcal.diagnosis.findings import at_last_fit, curve_findings, kept_out_error, named_findings, swap_findings
-from robcal.diagnosis.gain.heldout import noise_floor
-from robcal.diagnosis.gain.region import region_errors
+from robcal.diagnosis.gain.heldout import noise_floor, region_errors
 from robcal.diagnosis.next_poses import separating_poses
 from robcal.diagnosis.noise.components import Noise, estimate_noise
 from robcal.diagnosis.noise.swaps import find_swaps, relabelled

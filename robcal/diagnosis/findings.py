@@ -15,9 +15,8 @@ from robcal.diagnosis.scan.posterior import rivals, signature
 from robcal.diagnosis.scan.statistics import orthonormal_basis
 from robcal.diagnosis.search.curves import Curves
 from robcal.diagnosis.search.selection import Selection, poses_that_carry
-from robcal.physics.cause import Array, ObservationData, numeric_sigma
+from robcal.physics.cause import Array, ObservationData, numeric_sigma, prior_scale
 from robcal.physics.measuring import swapped
-from robcal.physics.prior_scale import prior_scale
 from robcal.robot.model import RobotModel
 
 

@@ -83,7 +83,9 @@ def gauss_newton(
         step = solve_step(r, J, None if prior_scale is None else trust * prior_scale)
         change = J @ step
         predicted_gain = float(r @ change - 0.5 * change @ change)
-        small = max(settings.cost_tolerance * (1.0 + cost), settings.negligible)
+        # measurements that scatter more than they state make all differences of the cost larger
+        variance = max(1.0, 2.0 * cost / max(1, J.shape[0] - J.shape[1]))
+        small = max(settings.cost_tolerance * (1.0 + cost), settings.negligible * variance)
         if predicted_gain <= small:
             return state, summary(True, "a further step would not lower the cost")
         length = 1.0

@@ -13,7 +13,8 @@ class TerminationSettings:
     max_halvings : halvings of one step at most.
     cost_tolerance : stop when a step lowers, or is predicted to lower, half the sum of squares by less than this
         fraction of it (plus the same fraction of one),
-    negligible : or by less than this, for whitened residuals: 1e-4 are 0.014 standard deviations of one parameter.
+    negligible : or by less than this times the variance of the whitened residuals (one at least): 1e-4 are 0.014
+        standard deviations of one parameter.
     """
 
     max_iterations: int = 30

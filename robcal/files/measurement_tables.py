@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from robcal.calibration.slips import empty_readings, frozen_readings
+from robcal.calibration.recording_errors import empty_readings, frozen_readings
 from robcal.errors import InvalidInput
 from robcal.files.frame_tables import SIX, frame_covariance_columns, twist_covariance
 from robcal.files.tables import Table, read_table

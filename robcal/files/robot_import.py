@@ -19,8 +19,7 @@ from robcal.files.tables import read_table
 from robcal.files.yaml_io import read_yaml
 from robcal.robot.dh import DHRow, frames_from_dh
 from robcal.robot.model import RobotModel
-from robcal.robot.urdf import model_from_steps, model_from_urdf
-from robcal.robot.urdf_chain import UrdfStep
+from robcal.robot.urdf_chain import UrdfStep, model_from_steps, model_from_urdf
 from robcal.transforms import frame_from_xyzrpy
 
 _MAX_BYTES = 20_000_000

@@ -4,10 +4,12 @@ Constants that bend a law (an order, the pose of a jump, a torque scale, a time 
 continuous ones among them may be refined between the grid's values. Causes of the robot act through its kernel: `bases`
 names expressions of the robot's variables that are added to a number of a frame. Causes of observations displace what
 was measured: `observation_shift` gives the displacement of every observation per unit of each parameter.
+
+Sizes that deviations of robots usually have: the measure of priors, steps, and doubts about what is held.
 """
 
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robcal.cause import Cause, Kind, describe
-from robcal.robot.terms import evaluate
+from robcal.robot.terms import evaluate, identifier
 
 Array = NDArray[Any]
 """Real numbers, indices or masks: the diagnosis handles all three."""
@@ -227,3 +229,30 @@ def numeric_sigma(
             else [float(v) for v in deviations]
         )
     return reported, sigma
+
+
+DEVIATION = 1e-3
+"""m or rad."""
+DEFLECTION = 3e-4
+"""rad under the largest load of a recording."""
+LEAST_MOMENT = 0.1
+"""N m; what stays below it carries no load."""
+
+
+def prior_scale(name: str, variables: Mapping[str, Array]) -> float:
+    """Usual size of a deviation (m, rad), or of an elasticity (rad/(N m)) by the deflection under the largest load.
+
+    Zero for anything else (loads, gravity, amplitudes), and for elasticities without a load.
+    """
+    frame, _, kind = name.rpartition(".")
+    if not kind.startswith("elastic_"):
+        geometric = kind in ("x", "y", "z", "roll", "pitch", "yaw") and not frame.startswith("payload.")
+        return DEVIATION if geometric else 0.0
+    moment = variables.get(f"{identifier(frame)}_m{kind.removeprefix('elastic_')}")
+    largest = 0.0 if moment is None else float(np.max(np.abs(moment)))
+    return DEFLECTION / largest if largest > LEAST_MOMENT else 0.0
+
+
+def prior_scales(names: Sequence[str], variables: Mapping[str, Array]) -> Array:
+    """The same for many names (p,)."""
+    return np.array([prior_scale(name, variables) for name in names])

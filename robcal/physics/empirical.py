@@ -26,8 +26,8 @@ LEAST_IN_BUMP = 3
 REACH = 1.5
 SLACK = (0.15, 0.4, 0.65)
 """Shares of half a joint's range within which a cable hangs slack."""
-CURVE_PRIOR = 3e-4
-"""Typical amplitude of one bump of a joint's error curve, rad."""
+PULL_PRIOR = 3e-4
+"""Typical pull of a taut cable at the end of a joint's range, rad."""
 
 
 def empirical_causes(site: RobotSite) -> Iterator[RobotCause]:
@@ -200,46 +200,5 @@ def _taut(site: RobotSite, joint: Joint, other: Joint) -> RobotCause:
         grid=tuple({"above": middle + share * half, "below": middle - share * half} for share in SLACK),
         bases=bases,
         covariates=(name,),
-        default_prior=CURVE_PRIOR / max(half, 1e-9),
+        default_prior=PULL_PRIOR / max(half, 1e-9),
     )
-
-
-def periodic_curve(joint: Joint, angles: Array, bumps: int) -> RobotCause:
-    """An irregular error of a joint that repeats every turn: bumps all round the circle; angles (n,) as recorded, rad.
-
-    The bumps are von Mises' (exp(cos)), so a joint at -90 deg and at 270 deg has the same error. Where the joint never
-    was their amplitudes stay zero with the uncertainty of their prior, which predictions there need.
-    """
-    k = joint.number
-    spacing = 2.0 * np.pi / bumps
-    centres = [float(np.round(i * spacing, 9)) for i in range(bumps)]
-    sharp = float(np.round(1.0 / (0.9 * spacing) ** 2, 6))
-
-    def bases(c: Constants) -> tuple[Basis, ...]:
-        return tuple(
-            Basis(joint.frame, "q", f"exp(sharp*(cos(q{k} - centre) - 1))", f"c{i}", {"sharp": sharp, "centre": x})
-            for i, x in enumerate(centres)
-        )
-
-    return RobotCause(
-        UNKNOWN,
-        joint.where,
-        _place(joint, "q"),
-        (),
-        (),
-        lambda v, c: {
-            "term": _term([f"q{k}"], "gaussian_process", _formula(bases(c), v)),
-            "period_deg": 360.0,
-            "rms_deg": float(np.degrees(np.std(_curve_values(bases(c), v, f"q{k}", angles)))),
-        },
-        "The angle of {where} is wrong by an irregular curve that repeats every turn ({rms_deg:.4f} deg RMS), as of an "
-        "encoder or gear with uneven pitch",
-        grid=({"bumps": float(bumps)},),
-        bases=bases,
-        covariates=(f"q{k}",),
-        default_prior=CURVE_PRIOR,
-    )
-
-
-def _curve_values(bases: tuple[Basis, ...], values: Array, name: str, angles: Array) -> Array:
-    return np.asarray(np.sum([v * b.value({name: angles}) for b, v in zip(bases, values, strict=True)], axis=0))

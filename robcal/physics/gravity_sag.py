@@ -5,8 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from robcal.cause import Kind
-from robcal.physics.cause import DEG, Array, Basis, Constants, Entry, RobotCause
-from robcal.physics.prior_scale import DEFLECTION
+from robcal.physics.cause import DEFLECTION, DEG, Array, Basis, Constants, Entry, RobotCause
 from robcal.physics.site import LETTER_OF_KIND, Joint, RobotSite, each_joint
 from robcal.robot.gravity_regressor import direction_of_gravity, expressions, regressor
 from robcal.robot.model import RobotModel
@@ -16,6 +15,7 @@ GRAVITY_SAG = Kind(
     "robot",
     "sag under weights that are not stated",
     "{where} sags about {direction} by {sag_deg:.4f} deg under weights that the robot file does not state",
+    expected=True,
 )
 KNOWN_TO_GIVE = 3.0
 """Prior weight of the sag about a joint's own axis: every joint gives way there, and every arm has weight."""

@@ -6,8 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from robcal.cause import Kind
-from robcal.physics.cause import PER_KNM, Array, Basis, Constants, Entry, RobotCause
-from robcal.physics.prior_scale import LEAST_MOMENT
+from robcal.physics.cause import LEAST_MOMENT, PER_KNM, Array, Basis, Constants, Entry, RobotCause
 from robcal.physics.site import LETTER_OF_KIND, Joint, RobotSite, breaks, each_joint, evenly, exponential_law
 from robcal.robot.terms import identifier
 

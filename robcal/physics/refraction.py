@@ -17,6 +17,9 @@ REFRACTION = Kind(
 
 STEP = 1e-3
 """Metres over which the field is differentiated: it is a polynomial of the second degree, so any will do."""
+LARGEST = 3e-4
+"""1/m: lines of sight do not bend more. Air does by 1e-6 per kelvin and metre of its gradient (Ciddor, 1996); the rest
+is left to windows."""
 
 
 def refraction_causes(data: ObservationData) -> Iterator[ObservationCause]:
@@ -116,7 +119,15 @@ def _bent_from_origin(axis: int) -> ObservationCause:
         return {"curvature_per_km": 1e3 * float(v[0]), "term": term}
 
     return ObservationCause(
-        REFRACTION, "station", letter, ("curvature",), (2e-5,), report, observation_shift=_warping(bent), weight=0.125
+        REFRACTION,
+        "station",
+        letter,
+        ("curvature",),
+        (2e-5,),
+        report,
+        observation_shift=_warping(bent),
+        weight=0.125,
+        limits=(-LARGEST, LARGEST),
     )
 
 
@@ -156,4 +167,5 @@ def _warped(data: ObservationData) -> ObservationCause:
         "The lines of sight of the station are bent (refraction): the measured space is warped",
         observation_shift=_warping(bent),
         weight=0.25,
+        limits=(-LARGEST, LARGEST),
     )

@@ -5,8 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from robcal.physics.cause import DEG, Array, RobotCause
-from robcal.physics.prior_scale import DEFLECTION, LEAST_MOMENT
+from robcal.physics.cause import DEFLECTION, DEG, LEAST_MOMENT, Array, RobotCause
 from robcal.robot.model import RobotModel
 
 ANGLE_OF_AXIS = {"x": "roll", "y": "pitch", "z": "yaw"}

@@ -5,9 +5,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from robcal.cause import Kind
-from robcal.physics.cause import DEG, PER_KNM, Array, Basis, Constants, Entry, Report, RobotCause
+from robcal.physics.cause import DEG, LEAST_MOMENT, PER_KNM, Array, Basis, Constants, Entry, Report, RobotCause
 from robcal.physics.gravity_sag import without_masses
-from robcal.physics.prior_scale import LEAST_MOMENT
 from robcal.physics.site import LETTER_OF_KIND, Joint, RobotSite, breaks, each_place, exponential_law
 from robcal.robot.terms import identifier
 

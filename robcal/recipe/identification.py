@@ -7,7 +7,7 @@ import numpy as np
 from robcal.calibration.identification import IdentifiedRobot, IdentifyOptions
 from robcal.calibration.joint_log import JointLog
 from robcal.calibration.measurements import RobotRecording, Rows
-from robcal.calibration.recording_faults import check_failed_fit, check_joint_log
+from robcal.calibration.recording_errors.search import check_failed_fit, check_joint_log
 from robcal.calibration.variance_components import identify_recording
 from robcal.calibration.verification import fit_nominal
 from robcal.errors import InvalidInput

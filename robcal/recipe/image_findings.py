@@ -5,8 +5,7 @@ from dataclasses import dataclass
 
 from robcal.diagnosis.images.diagnosis import ImageDiagnosis, ImageFinding, diagnose_images
 from robcal.diagnosis.images.exchange import exchanged_targets
-from robcal.diagnosis.images.lens_findings import beyond_lenses, station_findings, survey_findings
-from robcal.diagnosis.images.scale_findings import scale_findings
+from robcal.diagnosis.images.lens_findings import beyond_lenses, scale_findings, station_findings, survey_findings
 from robcal.diagnosis.images.station import given_points
 from robcal.photogrammetry.core.camera import Camera
 from robcal.photogrammetry.core.network import CameraNetwork

@@ -1,5 +1,9 @@
-"""The diagnosis of an identified robot: what it starts from, and the robot and measurements that it leaves behind."""
+"""The diagnosis of an identified robot: what it starts from, and the robot and measurements that it leaves behind.
 
+Measurements freed of what the diagnosis found in the measuring system: a verification speaks of the robot.
+"""
+
+import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -10,10 +14,10 @@ from robcal.calibration.cell import with_fitted_cell
 from robcal.calibration.identifiability import weak_parameters
 from robcal.calibration.identification import IdentifiedRobot
 from robcal.calibration.joint_log import JointLog
-from robcal.calibration.measurements import RobotRecording, Rows, evenly_weighted
-from robcal.calibration.observations import FrameObservations, PointObservations
+from robcal.calibration.measurements import RobotObservations, RobotRecording, Rows, evenly_weighted
+from robcal.calibration.observations import DistanceObservations, FrameObservations, PointObservations
 from robcal.diagnosis.core.fitting import Accepted, fit
-from robcal.diagnosis.core.recording import Recording
+from robcal.diagnosis.core.recording import Recording, observation_data
 from robcal.diagnosis.core.result import Diagnosis
 from robcal.diagnosis.diagnose import diagnose
 from robcal.diagnosis.images.diagnosis import ImageFinding
@@ -23,9 +27,7 @@ from robcal.diagnosis.search.selection import SelectionSettings
 from robcal.photogrammetry.core.bodies import Body
 from robcal.photogrammetry.measure.measured_points import MeasuredPoints
 from robcal.photogrammetry.station.network import StationOrientation
-from robcal.physics.cause import ObservationCause
-from robcal.physics.prior_scale import DEVIATION
-from robcal.recipe.corrections import corrected
+from robcal.physics.cause import DEVIATION, ObservationCause
 from robcal.recipe.evidence import Evidence, evidence_of
 from robcal.recipe.identification import Identification
 from robcal.recipe.image_findings import ImageFindings
@@ -34,7 +36,47 @@ from robcal.recipe.lack_of_fit import missing_joint_sigma
 from robcal.recipe.noise import noise_of
 from robcal.recipe.order import covariance_without_order, placed, without_order
 from robcal.recipe.recording import recording_for_diagnosis
-from robcal.transforms import Array
+from robcal.robot.kernel_cache import kernel_of
+from robcal.transforms import Array, retract
+
+MEASURING = ("camera", "wire", "sensor")
+"""Stages whose causes displace what is measured; those of the body are judged by the frames already."""
+
+
+def corrected(
+    recording: RobotRecording, log: JointLog, diagnosis: Diagnosis, moves: bool = True
+) -> RobotRecording | None:
+    """The recording without the displacements found in the measuring system; None where there are none.
+
+    ``moves`` : whether those that follow the order of the poses are still in it.
+    Weakness: displaced targets of a body and exchanged ids are not corrected in frames.
+    """
+    found = [
+        (f, f.cause)
+        for f in diagnosis.findings
+        if isinstance(f.cause, ObservationCause) and f.cause.stage in MEASURING and (moves or not f.cause.of_order)
+    ]
+    if not found:
+        return None
+    kernel = kernel_of(diagnosis.model, "converged")
+
+    def displaced(o: RobotObservations) -> RobotObservations:
+        rows = Recording(log.q, log.payload, log.recorded(), log.names, o)
+        inputs = rows.inputs(kernel)
+        data = observation_data(rows, kernel.frames(kernel.theta0, inputs), kernel.variables(kernel.theta0, inputs))
+        shifts = (cause.observation_shift(data, f.constants) @ f.values for f, cause in found)
+        shift = sum(shifts, np.zeros(()))
+        if isinstance(o, FrameObservations):
+            return dataclasses.replace(o, world_T_tool=retract(o.world_T_tool, -shift))
+        if isinstance(o, DistanceObservations):
+            return dataclasses.replace(o, distance=o.distance - shift.reshape(-1))
+        return dataclasses.replace(o, p_world=o.p_world - shift)
+
+    observations, detailed = (
+        tuple(displaced(o) for o in some) for some in (recording.observations, recording.detailed)
+    )
+    return dataclasses.replace(recording, observations=observations, detailed=detailed)
+
 
 BEYOND_DOUBT = 1e-6
 

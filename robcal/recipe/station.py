@@ -7,8 +7,7 @@ import numpy as np
 
 from robcal.diagnosis.images.camera_moves import which_moved, with_small_moves
 from robcal.diagnosis.images.diagnosis import ImageFinding
-from robcal.diagnosis.images.dot_sizes import with_dot_sizes
-from robcal.diagnosis.images.light_lag import without_lag
+from robcal.diagnosis.images.light_lag import with_dot_sizes, without_lag
 from robcal.diagnosis.images.station import station_data
 from robcal.photogrammetry.core.bodies import Body
 from robcal.photogrammetry.core.camera import Camera

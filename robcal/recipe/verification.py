@@ -36,6 +36,7 @@ class RobotVerification:
     delivered : against the measurements as they are, predicted from what the table of poses states, as for any user.
     recorded : with what only the recording knows (approach directions inferred, measurements freed of what was found in
         the measuring system), None where there is nothing of that.
+    unstated : the same without the approach directions that were inferred; None where there are none.
     rows : (n,) rows of the poses in the joint log. notes : what was left out or assumed.
     """
 
@@ -43,6 +44,7 @@ class RobotVerification:
     recorded: Verification | None
     rows: Rows = field(repr=False)
     notes: tuple[str, ...] = ()
+    unstated: Verification | None = None
 
 
 def verify_robot(
@@ -101,18 +103,22 @@ def verify_robot(
         # in the world, the robot is as uncertain as the station as well
         _, C = robot.predict(stated.subset(kept_out))
         outcome = replace(outcome, predicted=np.sqrt(np.trace(C[:, :3, :3], axis1=1, axis2=2) / 3.0))
-    recorded = None
+    recorded, unstated = None, outcome if log.inferred else None
     if not foreign and (freed is not None or log.inferred):
         used = recording if freed is None else freed
         at_home = with_fitted_cell(robot.kernel, inputs.subset(rows), used.select(rows))
         beside = replace(tested, model=at_home)
         recorded = verify(beside, inputs.subset(kept_out), used.select(kept_out))
         if freed is not None:
+            if log.inferred:
+                at_home = with_fitted_cell(robot.kernel, stated.subset(rows), used.select(rows))
+                beside = replace(tested, model=at_home)
+                unstated = verify(beside, stated.subset(kept_out), used.select(kept_out))
             # the stated uncertainty is that of the robot; faults of the measuring are told apart
             judged = {name: getattr(recorded, name) for name in ("normalised", "degrees", "p_value", "coverage_95")}
             outcome = replace(outcome, **judged)
             notes = [*notes, "uncertainties are judged without the faults of the measuring system that were found"]
-    return RobotVerification(outcome, recorded, kept_out, tuple(notes))
+    return RobotVerification(outcome, recorded, kept_out, tuple(notes), unstated)
 
 
 def kept_out_gain(

@@ -13,14 +13,17 @@ from robcal.calibration.observations import FrameObservations
 from robcal.calibration.pose_candidates import Cell, check_poses, find_candidates
 from robcal.calibration.pose_choice import (
     Design,
+    balanced_approaches,
     choose_d_optimal,
     choose_worst_case,
     covariance_of,
     exchange,
+    joint_ranges,
+    path_length,
     predicted_errors,
+    short_order,
     spread,
 )
-from robcal.calibration.pose_order import balanced_approaches, joint_ranges, path_length, short_order
 from robcal.calibration.poses import PoseRequest, generate_poses
 from robcal.calibration.visibility import Viewpoint, VisibilityRules, measurable, seen_targets
 from robcal.errors import InvalidInput

@@ -11,10 +11,11 @@ from robcal.calibration.observations import FrameObservations
 from robcal.diagnosis.core.fitting import Accepted, Fit, fit, terms_of
 from robcal.diagnosis.core.recording import Recording
 from robcal.diagnosis.diagnose import diagnose
-from robcal.diagnosis.search.curves import LEAST_POSES, curve, find_curves, likenesses, nested_errors
-from robcal.physics.empirical import periodic_curve
+from robcal.diagnosis.search.curves import LEAST_POSES, find_curves, frozen_terms, likenesses, nested_errors
+from robcal.physics.angle_error_curve import periodic_curve
 from robcal.physics.site import Joint
 from robcal.robot.kernel import Kernel
+from robcal.robot.terms import evaluate
 from tests.calibration.scenarios import Scenario, scenario
 
 ORDERS = np.arange(3, 25)
@@ -55,16 +56,41 @@ def uneven() -> tuple[Recording, Fit, np.ndarray]:
 def test_curves_of_all_joints_are_found(uneven: tuple[Recording, Fit, np.ndarray]) -> None:
     recording, present, added = uneven
     found = find_curves(present, recording)
-    assert [item.cause.where for item in found.accepted] == [f"axis{k}" for k in range(1, 7)]
+    assert [item.cause.where for item in found.accepted] == ["all joints", *(f"axis{k}" for k in range(1, 7))]
     assert found.p_value < 1e-100
     errors = nested_errors(present, recording, found.accepted, None)
-    assert len(errors) == 7
+    assert len(errors) == 8
     assert errors[-1] < 0.4 * errors[0]
-    for k, item in enumerate(found.accepted):
+    told = found.accepted[0].cause.report(found.accepted[0].values, found.accepted[0].constants)
+    assert told["sense"] == {f"axis{k}": -1 if k == 3 else 1 for k in range(1, 7)}
+    turns = np.array(list(told["shift_deg"].values()))  # type: ignore[attr-defined]
+    assert turns == pytest.approx(np.degrees([0.0, 0.7, 1.0, 2.1, 2.8, 3.5]), abs=1.0)
+    for k in range(6):
         q = recording.q[:, k]
         slow = np.vander(q, 5)  # zero offsets and slow waves are also geometry
-        truth, reported = (y - slow @ np.linalg.lstsq(slow, y, rcond=None)[0] for y in (added[:, k], curve(item, q)))
+        both = of_joint(found.accepted, k + 1, q)
+        truth, reported = (y - slow @ np.linalg.lstsq(slow, y, rcond=None)[0] for y in (added[:, k], both))
         assert np.corrcoef(truth, reported)[0, 1] > 0.9
+
+
+def of_joint(accepted: tuple[Accepted, ...], number: int, q: np.ndarray) -> np.ndarray:
+    """What all curves together add to the angle of a joint."""
+    total = np.zeros(len(q))
+    for item in accepted:
+        value = dict(zip(item.names, item.values, strict=True))
+        laws = [b for b in item.cause.laws(item.constants) if b.frame == f"axis{number}"]
+        total = total + sum(value[b.parameter] * b.value({f"q{number}": q}) for b in laws)
+    return total
+
+
+def test_a_shared_curve_held_as_numbers_is_the_same_robot(uneven: tuple[Recording, Fit, np.ndarray]) -> None:
+    recording, present, _ = uneven
+    item = find_curves(present, recording).accepted[0]
+    inputs = {f"q{k + 1}": recording.q[:, k] for k in range(6)}
+    for number in range(1, 7):
+        held = [t for t in frozen_terms(item) if t.frame == f"axis{number}"]
+        value = np.sum([evaluate(t.expression, inputs) for t in held], axis=0)
+        assert value == pytest.approx(of_joint((item,), number, recording.q[:, number - 1]))
 
 
 def test_likeness_tells_turn_and_sense() -> None:
@@ -116,7 +142,7 @@ def test_diagnosis_models_the_curves(uneven: tuple[Recording, Fit, np.ndarray]) 
     recording, present, added = uneven
     reported = diagnose(present.model, recording, present.free)
     curves = [f for f in reported.findings if "period_deg" in f.parameters]
-    assert [f.cause.where for f in curves] == [f"axis{k}" for k in range(1, 7)]
+    assert [f.cause.where for f in curves] == ["all joints", *(f"axis{k}" for k in range(1, 7))]
     assert reported.heldout[1] < 0.4 * reported.heldout[0]
     assert reported.joint_sigma < 0.5 * np.std(added)
     assert "turned by" in " ".join(f.statement for f in curves)

@@ -8,7 +8,7 @@ import numpy as np
 
 from robcal.diagnosis.core.fitting import fit
 from robcal.diagnosis.diagnose import diagnose
-from robcal.diagnosis.gain.region import SHARE, extrapolated, outermost, region_errors
+from robcal.diagnosis.gain.heldout import SHARE, extrapolated, outermost, region_errors
 from robcal.recipe.robot_diagnosis import optional_parameters, own_elasticities
 from tests.diagnosis.recordings import concealed
 

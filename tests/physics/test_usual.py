@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from robcal.physics.prior_scale import DEFLECTION, DEVIATION, prior_scale, prior_scales
+from robcal.physics.cause import DEFLECTION, DEVIATION, prior_scale, prior_scales
 
 
 def test_an_elasticity_is_measured_by_the_largest_load() -> None:

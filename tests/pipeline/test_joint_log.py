@@ -76,7 +76,7 @@ def test_a_slip_that_leaves_the_ranges_is_named_as_well(
     with pytest.raises(InvalidInput, match="outside the range") as error:
         run_campaign(frame_campaign, tmp_path / "run", until="identify")
     assert f"a likely cause: {words}" in str(error.value) or f"a likely cause: the {words}" in str(error.value)
-    assert "mending it lowers the miss" in str(error.value)
+    assert "correcting it lowers the residual" in str(error.value)
 
 
 def test_a_small_slip_is_looked_for_where_the_fit_fails(tmp_path: Path) -> None:
@@ -88,7 +88,7 @@ def test_a_small_slip_is_looked_for_where_the_fit_fails(tmp_path: Path) -> None:
             row["q6_deg"] = str(-float(row["q6_deg"]))
 
     edit_rows(tmp_path / "campaign" / "poses.csv", change)
-    with pytest.raises(InvalidInput, match=r"axis6.*wrong sign.*mending it lowers"):
+    with pytest.raises(InvalidInput, match=r"axis6.*wrong sign.*correcting it lowers"):
         run_campaign(tmp_path / "campaign", tmp_path / "run", until="identify")
 
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from robcal.robot.chain import chain_of
+from robcal.robot.inverse_analytic import angle_between, to_distance, to_plane, two_turns
 from robcal.robot.structure import ParallelArm, SphericalWrist, find_structure, meeting_point, parallel
-from robcal.robot.subproblems import angle_between, to_distance, to_plane, two_turns
 from robcal.transforms import exp_so3
 from tests.robot.chains import random_chain
 from tests.robot.test_inverse import random_wrist_arm

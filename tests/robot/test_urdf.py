@@ -13,7 +13,7 @@ from robcal.errors import InvalidInput
 from robcal.robot.chain import chain_of, forward
 from robcal.robot.export.urdf import calibrated_frames, urdf_text
 from robcal.robot.model import Frame, RobotModel
-from robcal.robot.urdf import model_from_urdf
+from robcal.robot.urdf_chain import model_from_urdf
 from tests.robot.chains import kr_like, random_chain
 
 pytest.importorskip("yourdfpy")

@@ -7,11 +7,11 @@ import numpy as np
 
 from robcal.diagnosis.core.recording import Recording, observation_data
 from robcal.diagnosis.scan.statistics import orthonormal_basis
-from robcal.physics.cause import Array, Constants, LinearCause, ObservationCause
-from robcal.physics.prior_scale import prior_scales
+from robcal.physics.cause import Array, Constants, LinearCause, ObservationCause, prior_scales
 from robcal.robot.kernel import Kernel, PoseInputs
 from robcal.robot.kernel_cache import kernel_of
 from robcal.robot.model import RobotModel, Term
+from robcal.robot.terms import identifier
 
 UNDETERMINED = 1e-6
 """Directions of the scaled Jacobian below this share of the largest stay as they are: their sigma would be a radian."""
@@ -45,7 +45,7 @@ class Accepted:
 
     def term(self, number: int) -> str:
         """Name of its term in the kernel, as the cause of that number."""
-        return f"{self.cause.where}_{self.cause.name}_{number}"
+        return f"{identifier(self.cause.where)}_{self.cause.name}_{number}"
 
     def full_names(self, number: int) -> tuple[str, ...]:
         """Names of the kernel's parameters that are the amplitudes of a robot cause."""

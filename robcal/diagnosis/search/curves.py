@@ -16,9 +16,10 @@ from robcal.diagnosis.core.fitting import Accepted, Fit
 from robcal.diagnosis.core.recording import Recording
 from robcal.diagnosis.gain.heldout import folds, rms
 from robcal.diagnosis.scan.statistics import log_f_probability
-from robcal.diagnosis.scan.tangents import tangents
+from robcal.diagnosis.scan.tangents import Tangents, tangents
+from robcal.diagnosis.search.shared_curve import Likeness, maker, pattern, refined
+from robcal.physics.angle_error_curve import Placed, beside_shared, periodic_curve
 from robcal.physics.cause import Array, LinearCause, RobotCause
-from robcal.physics.empirical import periodic_curve
 from robcal.physics.site import RobotSite
 from robcal.robot.model import Term
 
@@ -36,27 +37,14 @@ WAVES = 2
 HIGHEST_WAVE = 60.0
 IRREGULAR = 0.35
 """Share of a curve's variance that so many waves leave: below, the curve is regular and has a name."""
+OWN_SIZES = (1.0, 0.3, 0.1)
+"""Sizes, in those of a curve, of what joints that share one may differ by; the kept-out poses choose."""
+HELD_PARTS = 20
+"""Bumps in one expression of a curve that is held."""
+LEAST_SHARED = 2
+"""Joints that must have a curve in common."""
 SEVERAL = 2
 """With so many irregular joints all joints get a curve."""
-
-
-@dataclass(frozen=True)
-class Likeness:
-    """A joint whose curve is that of another: `joint(q) = sense * other(sense * q + shift)`.
-
-    Attributes
-    ----------
-    joint, other : a joint and an earlier one that has the same curve. shift : rad.
-    sense : -1 for a part mounted the other way round.
-    correlation : of the two curves where both are known. overlap : rad.
-    """
-
-    joint: str
-    other: str
-    sense: int
-    shift: float
-    correlation: float
-    overlap: float
 
 
 @dataclass(frozen=True)
@@ -65,9 +53,10 @@ class Curves:
 
     Attributes
     ----------
-    accepted : one cause per joint with its amplitudes, to be fitted again with everything else.
+    accepted : one cause per joint with its amplitudes, to be fitted again with everything else; before them the curve
+        that joints share, where they do.
     shares : share of the sum of squares above the noise that each explains.
-    likenesses : joints whose curves are alike.
+    likenesses : joints whose curves are alike, where none is shared.
     p_value : of the F test of all curves together, for all scales tried.
     """
 
@@ -130,22 +119,76 @@ def find_curves(present: Fit, recording: Recording) -> Curves:
     keep = irregular if len(irregular) < SEVERAL else list(everyone)
     if not keep or folded.kept_out(keep) > GAIN * before:
         return Curves()
-    chosen = [columns[k] for k in keep]
-    values = _solve(present, chosen)
+    alone = _accepted(present, [causes[k] for k in keep], [columns[k] for k in keep])
+    alike = likenesses(alone, [site.variables[f"q{joints[k].number}"] for k in keep])
+    group = _Group(present, at, label, [causes[k] for k in keep], [columns[k] for k in keep])
+    chosen = _with_shared(group, pattern([joints[k] for k in keep], alike), dict(site.variables), len(joints))
+    accepted, used = (alone, group.columns) if chosen is None else chosen
     r = present.residual
     square = float(r @ r)
-    shares = tuple(float(np.clip((c @ v) @ r / square, 0.0, 1.0)) for c, v in zip(chosen, values, strict=True))
-    left = r - np.sum([c @ v for c, v in zip(chosen, values, strict=True)], axis=0)
-    count = sum(_visited(site.variables[f"q{joints[k].number}"], chosen[0].shape[1]) for k in keep)
+    parts = [c @ (item.values / item.cause.sizes(item.constants)) for c, item in zip(used, accepted, strict=True)]
+    shares = tuple(float(np.clip(part @ r / square, 0.0, 1.0)) for part in parts)
+    left = r - np.sum(parts, axis=0)
+    count = sum(_visited(site.variables[f"q{joints[k].number}"], columns[k].shape[1]) for k in keep)
     log_p = log_f_probability(
         np.array([square - left @ left]), np.array([count]), np.array([square]), len(r) - present.jacobian.shape[1]
     )
-    accepted = tuple(
-        Accepted(f := causes[k], f.grid[0], v * f.sizes(f.grid[0]), np.zeros((len(v), len(v))))
-        for k, v in zip(keep, values, strict=True)
+    return Curves(
+        accepted, shares, alike if chosen is None else (), float(min(1.0, len(BUMPS_A_TURN) * np.exp(log_p[0])))
     )
-    alike = likenesses(accepted, [site.variables[f"q{joints[k].number}"] for k in keep])
-    return Curves(accepted, shares, alike, float(min(1.0, len(BUMPS_A_TURN) * np.exp(log_p[0]))))
+
+
+@dataclass(frozen=True)
+class _Group:
+    """Curves of joints on trial: where they are linearised, folds of the rows, causes and their scaled columns."""
+
+    present: Fit
+    at: Tangents
+    label: Array
+    causes: Sequence[RobotCause]
+    columns: Sequence[Array]
+
+
+def _accepted(present: Fit, causes: Sequence[RobotCause], columns: Sequence[Array]) -> tuple[Accepted, ...]:
+    """Causes with the amplitudes that fit, scaled columns (m, c) each."""
+    values = _solve(present, columns)
+    return tuple(
+        Accepted(f, f.grid[0], v * f.sizes(f.grid[0]), np.zeros((len(v), len(v))))
+        for f, v in zip(causes, values, strict=True)
+    )
+
+
+def _with_shared(
+    group: _Group, placed: Sequence[Placed], variables: dict[str, Array], count: int
+) -> tuple[tuple[Accepted, ...], list[Array]] | None:
+    """One curve for the joints of a pattern, and what each differs by, where that predicts kept-out poses better."""
+    if len(placed) < LEAST_SHARED:
+        return None
+    bumps = group.columns[0].shape[1]
+    make, everyone = maker(bumps, variables, count), range(len(group.columns) + 1)
+    members = {p.joint.where for p in placed}
+    small = [1.0 if f.where not in members else OWN_SIZES[-1] for f in group.causes]
+
+    def solve(columns: Sequence[Array]) -> list[Array]:
+        return _solve(group.present, columns)
+
+    beside = [c * s for c, s in zip(group.columns, small, strict=True)]
+    shared = make(refined(placed, make, group.at, solve, beside))
+    common = group.at.columns(shared, shared.grid[0]) * shared.sizes(shared.grid[0])
+    best = _folded(group.present, group.columns, group.label).kept_out(everyone[:-1])
+    chosen = None
+    for size in OWN_SIZES:
+        scale = [size if f.where in members else 1.0 for f in group.causes]
+        own = [c * s for c, s in zip(group.columns, scale, strict=True)]
+        after = _folded(group.present, [common, *own], group.label).kept_out(everyone)
+        if after < best:
+            best, chosen = after, (scale, own)
+    if chosen is None:
+        return None
+    scale, own = chosen
+    causes = [f if s == 1.0 else beside_shared(f, s) for f, s in zip(group.causes, scale, strict=True)]
+    columns = [common, *own]
+    return _accepted(group.present, [shared, *causes], columns), columns
 
 
 def _visited(angles: Array, bumps: int) -> int:
@@ -155,11 +198,14 @@ def _visited(angles: Array, bumps: int) -> int:
 
 def frozen_terms(item: Accepted) -> tuple[Term, ...]:
     """Terms with the amplitudes as numbers."""
-    bases = item.cause.laws(item.constants)
-    parts = [f"{float(v)!r}*({b.expression})" for b, v in zip(bases, item.values, strict=True)]
+    value = dict(zip(item.names, item.values, strict=True))
+    parts: dict[tuple[str, str], list[str]] = {}
+    for b in item.cause.laws(item.constants):
+        parts.setdefault((b.frame, b.kind), []).append(f"{float(value[b.parameter])!r}*({b.expression})")
     return tuple(
-        Term(f"{item.cause.where}_held_{k}", bases[0].frame, bases[0].kind, " + ".join(parts[k : k + 24]))
-        for k in range(0, len(parts), 24)
+        Term(f"{item.term(k)}_held_{frame}", frame, kind, " + ".join(texts[k : k + HELD_PARTS]))
+        for (frame, kind), texts in parts.items()
+        for k in range(0, len(texts), HELD_PARTS)
     )
 
 

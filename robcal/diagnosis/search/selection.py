@@ -18,8 +18,7 @@ from robcal.diagnosis.scan.posterior import refine
 from robcal.diagnosis.scan.statistics import orthonormal_basis
 from robcal.diagnosis.scan.tangents import Laws
 from robcal.diagnosis.search.admissible import possible, refusal
-from robcal.physics.cause import Array, Constants, Key, LinearCause
-from robcal.physics.prior_scale import prior_scale
+from robcal.physics.cause import Array, Constants, Key, LinearCause, prior_scale
 from robcal.robot.model import RobotModel
 
 SAME_SCATTER = 0.2
@@ -40,7 +39,7 @@ class SelectionSettings:
     ----------
     level : family-wise level of a mismatch.
     further : share of that level which causes beside a first one must reach: each is another chance to be wrong.
-    most : causes at most.
+    most : causes at most beside those that every robot has.
     blunder_log_p : logarithm of the probability (all observations weighed in) below which one is a gross error.
     blunder_share : share of the observations that may be left out as gross errors.
     runs : simulations for the family-wise level.
@@ -134,7 +133,7 @@ def select(
             present, weighed = fit(model, recording, free, accepted), True
             continue
         trial = None
-        if analysis.p_value <= _level(analysis, accepted, settings) and len(accepted) < settings.most:
+        if analysis.p_value <= _level(analysis, accepted, settings) and _unexpected(accepted) < settings.most:
             trial = _extended(model, recording, free, analysis, barred, settings, tell)
         if trial is not None:
             accepted = trial.accepted
@@ -161,6 +160,11 @@ def select(
     return Selection(
         recording, present.accepted, tuple(p_values), first, analysis, free, tied, tuple(left_out), without, refused
     )
+
+
+def _unexpected(accepted: tuple[Accepted, ...]) -> int:
+    """Number of causes that not every robot has."""
+    return sum(not item.cause.kind.expected for item in accepted)
 
 
 def _weighed(model: RobotModel, recording: Recording, free: tuple[str, ...], present: Fit) -> tuple[Recording, Fit]:

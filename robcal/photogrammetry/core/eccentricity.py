@@ -3,12 +3,19 @@
 Two effects, both exact to second order of the dot's image size, and a third on curved bodies:
 
 - perspective: the centre of the projected ellipse is the pole of the line at infinity with respect to the dual conic
-  (Hartley and Zisserman, Multiple View Geometry, 2nd ed., 8.3), see :mod:`robcal.photogrammetry.core.eccentric_circle`;
+  (Hartley and Zisserman, Multiple View Geometry, 2nd ed., 8.3), see :mod:`robcal.photogrammetry.core.eccentricity`;
 - distortion changes across the dot: the area centroid of an ellipse with second moments ``S`` under a smooth map ``g``
   with Jacobian ``G`` and second derivatives ``H`` is ``g + H:S/2 + G S grad(ln det G)``. A least-squares ellipse
   through the contour has the same centre to this order;
 - a dot on a sphere ends in a plane below its centre (16 um at 5 mm on a radius of 200 mm): it is that circle which is
   seen, see :func:`rim_offset`.
+
+Centre of the image of a circular target: not the image of its centre.
+
+A circle with centre c, radius r and unit normal n (camera frame) has the dual conic ``c c' - r^2 (I - n n')``; the
+centre of its image is the pole of the line at infinity, hence the image of the point ``c - r^2 (e3 - n n_z) / c_z``
+(exact for a pinhole; the change of distortion across the dot is neglected).
+Source of dual conics: Hartley and Zisserman, Multiple View Geometry, 2nd ed., sections 2.2.3 and 8.3.
 """
 
 from functools import lru_cache
@@ -17,8 +24,17 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from robcal.photogrammetry.core.camera import Camera, project, project_with_jacobians
-from robcal.photogrammetry.core.eccentric_circle import effective_point
 from robcal.transforms import Array
+
+
+def effective_point(p_camera: ArrayLike, normal_camera: ArrayLike, radius: ArrayLike) -> Array:
+    """Points (..., 3) m whose image is the centre of the ellipse; NaN normals or radii mean no correction."""
+    p = np.asarray(p_camera, dtype=float)
+    n = np.asarray(normal_camera, dtype=float)
+    r = np.asarray(radius, dtype=float)[..., None]
+    shift = -(r**2) * (np.array([0.0, 0.0, 1.0]) - n * n[..., 2:3]) / p[..., 2:3]
+    return p + np.where(np.isfinite(shift), shift, 0.0)
+
 
 IntArray = NDArray[np.int64]
 

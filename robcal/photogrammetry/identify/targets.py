@@ -9,10 +9,9 @@ from numpy.typing import NDArray
 from robcal.imaging.detections import Detections, TargetKind
 from robcal.photogrammetry.core.bodies import Body, IntArray
 from robcal.photogrammetry.core.camera import Camera
-from robcal.photogrammetry.identify.extension import IdentifiedImage, Start, extended
+from robcal.photogrammetry.identify.extension import IdentifiedImage, Prediction, Start, extended
 from robcal.photogrammetry.identify.grid import has_rows, search_grid
 from robcal.photogrammetry.identify.grow import View, view_of
-from robcal.photogrammetry.identify.prediction import Prediction
 from robcal.photogrammetry.identify.search import search_body
 from robcal.photogrammetry.orientation.resection import Resection, refine_poses, resect_images
 

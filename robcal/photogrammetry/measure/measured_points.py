@@ -19,6 +19,22 @@ class RejectedPoint:
 
 
 @dataclass(frozen=True)
+class Exchange:
+    """Two targets that carried each other's number in some poses.
+
+    Attributes
+    ----------
+    targets : the two numbers, the smaller first. poses : numbers of the poses.
+    before, after : m, median deviation of the lengths to the other targets as recorded, and with the numbers exchanged.
+    """
+
+    targets: tuple[int, int]
+    poses: tuple[int, ...]
+    before: float
+    after: float
+
+
+@dataclass(frozen=True)
 class ResectedPoses:
     """Poses from all marks of the body at once, used where too few targets are seen by two cameras.
 
@@ -48,6 +64,7 @@ class MeasuredPoints:
     residual : (m,) root of chi-square by redundancy of the intersection, NaN without redundancy.
     station_jacobian : (m, 3, k) derivative by the station's parameters, station_covariance (k, k); None if not known.
     resected : poses by resection. rejected : points left out, with reason.
+    exchanges : numbers that were exchanged in some poses, and are right here.
     inconsistent_poses : poses in which most rays miss one another: evidence, nothing was left out for it.
     """
 
@@ -62,6 +79,7 @@ class MeasuredPoints:
     resected: ResectedPoses | None = None
     rejected: tuple[RejectedPoint, ...] = ()
     inconsistent_poses: tuple[int, ...] = ()
+    exchanges: tuple[Exchange, ...] = ()
 
     def __post_init__(self) -> None:
         m = len(self.pose)

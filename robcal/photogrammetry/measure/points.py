@@ -11,7 +11,7 @@ from scipy import stats
 from robcal.errors import DegenerateGeometry
 from robcal.photogrammetry.core.bodies import Body, IntArray, spans_plane
 from robcal.photogrammetry.core.camera import project
-from robcal.photogrammetry.core.eccentric_circle import effective_point
+from robcal.photogrammetry.core.eccentricity import effective_point
 from robcal.photogrammetry.measure.measured_points import MeasuredPoints, RejectedPoint, ResectedPoses
 from robcal.photogrammetry.measure.resected_poses import resect_poses
 from robcal.photogrammetry.orientation.intersection import Intersection, intersect

@@ -16,7 +16,7 @@ from robcal.estimation.grouping import members, whitener
 from robcal.estimation.summary import TerminationSettings
 from robcal.photogrammetry.core.bodies import Body, IntArray, line_ratio
 from robcal.photogrammetry.core.camera import Camera, project, project_with_jacobians
-from robcal.photogrammetry.core.eccentric_circle import effective_point
+from robcal.photogrammetry.core.eccentricity import effective_point
 from robcal.photogrammetry.orientation.closed_form import LINE, start_poses, three_point_search
 from robcal.transforms import Array, invert, retract, skew, transform
 

@@ -18,7 +18,7 @@ from robcal.estimation.levenberg import Linearised, levenberg
 from robcal.estimation.robust import huber_costs, huber_weights
 from robcal.estimation.summary import SolveSummary, TerminationSettings
 from robcal.photogrammetry.core.camera import INTRINSIC_NAMES, Camera, project_with_jacobians
-from robcal.photogrammetry.core.eccentric_circle import effective_point
+from robcal.photogrammetry.core.eccentricity import effective_point
 from robcal.photogrammetry.station.network import MarkTable, StationDesign, Unknowns
 from robcal.transforms import Array, invert, retract, skew
 

@@ -11,8 +11,7 @@ from robcal.errors import RobcalError
 from robcal.imaging.detections import Detections
 from robcal.photogrammetry.core.bodies import Body, IntArray
 from robcal.photogrammetry.core.camera import Camera
-from robcal.photogrammetry.identify.extension import IdentifiedImage
-from robcal.photogrammetry.identify.prediction import Prediction, predict_dots
+from robcal.photogrammetry.identify.extension import IdentifiedImage, Prediction, predict_dots
 from robcal.photogrammetry.identify.targets import coded_rows, identify_images, identify_targets
 from robcal.photogrammetry.orientation.resection import resect
 from robcal.photogrammetry.station.network import StationMarks, StationOrientation, StationSettings

@@ -12,7 +12,7 @@ from robcal.photogrammetry.bundle.start_network import Approximate, approximate_
 from robcal.photogrammetry.core.discs import Discs, discs_from_ellipses, modelled_discs, size_ratio
 from robcal.photogrammetry.core.network import CameraNetwork
 from robcal.photogrammetry.survey.assignments import Assignments, exclude_rejected, set_aside
-from robcal.photogrammetry.survey.inputs import SurveyInput
+from robcal.photogrammetry.survey.types import SurveyInput
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,7 @@ import numpy as np
 
 from robcal.errors import InvalidInput
 from robcal.robot.model import Frame, RobotModel
-from robcal.robot.urdf import model_from_urdf, turn_x_to
-from robcal.robot.urdf_chain import NEGLIGIBLE_MASS, UrdfStep, chain_steps, parse_urdf
+from robcal.robot.urdf_chain import NEGLIGIBLE_MASS, UrdfStep, chain_steps, model_from_urdf, parse_urdf, turn_x_to
 from robcal.transforms import Array, frame, frame_from_xyzrpy, invert, rotation_from_rpy, rpy_from_rotation
 
 EFFORT = 1e5

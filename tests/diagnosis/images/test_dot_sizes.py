@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from robcal.diagnosis.images.dot_sizes import with_dot_sizes
+from robcal.diagnosis.images.light_lag import with_dot_sizes
 from robcal.photogrammetry.core.bodies import Body
 from robcal.photogrammetry.core.eccentricity import centre_shift
 from tests.diagnosis.image_scenes import station

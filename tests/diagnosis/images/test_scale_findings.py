@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from robcal.diagnosis.images.scale_findings import scale_findings
+from robcal.diagnosis.images.lens_findings import scale_findings
 from robcal.photogrammetry.bundle.lengths import distances, length_results
 from robcal.photogrammetry.core.network import CameraNetwork, Lengths
 from tests.diagnosis.image_scenes import survey

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from robcal.photogrammetry.core.camera import Camera, project
-from robcal.photogrammetry.core.eccentric_circle import effective_point
+from robcal.photogrammetry.core.eccentricity import effective_point
 from tests.photogrammetry.networks import polygon_centre
 
 CAMERA = Camera(2400, 1800, 3000.0, 3000.0, 1200.0, 900.0)

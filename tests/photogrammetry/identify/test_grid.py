@@ -12,8 +12,7 @@ from robcal.imaging.detect import detect_targets
 from robcal.imaging.settings import DetectionSettings
 from robcal.photogrammetry.core.bodies import Body
 from robcal.photogrammetry.core.camera import Camera, project
-from robcal.photogrammetry.identify.congruence import congruences
-from robcal.photogrammetry.identify.grid import has_rows, search_grid
+from robcal.photogrammetry.identify.grid import congruences, has_rows, search_grid
 from robcal.photogrammetry.identify.grow import refine_with_lens
 from robcal.photogrammetry.identify.rows import body_rows, image_rows
 from robcal.photogrammetry.station.identify import identify_station

@@ -8,7 +8,7 @@ import pytest
 from robcal.imaging.detections import TargetKind
 from robcal.photogrammetry.core.bodies import Body
 from robcal.photogrammetry.core.camera import Camera, project
-from robcal.photogrammetry.identify.prediction import Prediction, predict_dots
+from robcal.photogrammetry.identify.extension import Prediction, predict_dots
 from robcal.photogrammetry.identify.targets import identify_images, identify_targets
 from robcal.photogrammetry.orientation.resection import resect
 from robcal.photogrammetry.station.identify import identify_station, spread_order

@@ -3,9 +3,13 @@ import pytest
 
 from robcal import transforms as tf
 from robcal.photogrammetry.core.bodies import Body
-from robcal.photogrammetry.measure.frames import MeasuredFrames, measure_frames
+from robcal.photogrammetry.measure.frames import (
+    MeasuredFrames,
+    frame_sensitivities,
+    measure_frames,
+    unabsorbed_covariance,
+)
 from robcal.photogrammetry.measure.measured_points import MeasuredPoints
-from robcal.photogrammetry.measure.shared_errors import frame_sensitivities, unabsorbed_covariance
 
 POINTS = np.array([[-0.2, -0.2, 0.0], [0.2, -0.2, 0.02], [0.2, 0.2, 0.0], [-0.2, 0.2, 0.03], [0.0, 0.0, 0.1]])
 SIGMA = 2e-5

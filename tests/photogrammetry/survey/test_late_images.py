@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from robcal.photogrammetry.survey.late_images import place_late
+from robcal.photogrammetry.survey.identification import place_late
 from tests.photogrammetry.networks import Truth, make_network
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from robcal.errors import InvalidInput
 from robcal.photogrammetry.core.network import Lengths
-from robcal.photogrammetry.survey.plausibility import rough_scale, scale_notes
+from robcal.photogrammetry.survey.final_frame import rough_scale, scale_notes
 
 POINTS = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0.2]])
 NETWORK = SimpleNamespace(ids=np.array([1, 2, 3, 4]), points=POINTS / 0.5)  # two units of its own are a metre

@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from robcal.imaging.detections import TargetKind
-from robcal.photogrammetry.survey.survey import BodyTarget, SurveyImage, survey_body
-from robcal.photogrammetry.survey.uncoded import needs_geometry
+from robcal.photogrammetry.survey.survey import BodyTarget, SurveyImage, needs_geometry, survey_body
 from tests.photogrammetry.networks import aligned_error, detections, make_network
 
 

@@ -1,0 +1,106 @@
+"""One curve for all joints that carry a copy of the same part: a pattern of turns and senses, refined together.
+
+What the curves of single joints say of each other starts it; turns then follow with everything else by Gauss-Newton
+steps. Joints that differ keep a curve of what they differ by, whose size the kept-out poses choose.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from robcal.diagnosis.scan.tangents import Tangents
+from robcal.physics.angle_error_curve import Placed, shared_curve
+from robcal.physics.cause import Array, RobotCause
+from robcal.physics.site import Joint
+
+ROUNDS = 4
+STEP = 1e-4
+"""rad, over which a curve is differentiated."""
+LARGEST_TURN = 0.05
+"""rad: largest step of a turn; the finest waves of a curve are a few times as long."""
+
+
+@dataclass(frozen=True)
+class Likeness:
+    """A joint whose curve is that of another: `joint(q) = sense * other(sense * q + shift)`.
+
+    Attributes
+    ----------
+    joint, other : a joint and an earlier one that has the same curve. shift : rad.
+    sense : -1 for a part mounted the other way round.
+    correlation : of the two curves where both are known. overlap : rad.
+    """
+
+    joint: str
+    other: str
+    sense: int
+    shift: float
+    correlation: float
+    overlap: float
+
+
+def pattern(joints: Sequence[Joint], likenesses: Sequence[Likeness]) -> tuple[Placed, ...]:
+    """The largest group of joints (in their order) whose curves are alike, the first of them as reference."""
+    groups: list[dict[str, Placed]] = []
+    by_name = {joint.where: joint for joint in joints}
+    for like in likenesses:
+        group = next((g for g in groups if like.other in g), None)
+        if group is None:
+            group = {like.other: Placed(by_name[like.other])}
+            groups.append(group)
+        other = group[like.other]
+        # sense (other.sense c(other.sense (sense q + shift) + other.shift))
+        shift = float((other.sense * like.shift + other.shift) % (2.0 * np.pi))
+        group[like.joint] = Placed(by_name[like.joint], like.sense * other.sense, shift)
+    return tuple(max(groups, key=len).values()) if groups else ()
+
+
+def refined(
+    placed: Sequence[Placed],
+    make: Callable[[Sequence[Placed]], RobotCause],
+    at: Tangents,
+    solve: Callable[[Sequence[Array]], list[Array]],
+    beside: Sequence[Array],
+) -> tuple[Placed, ...]:
+    """The pattern with turns that fit best, with the curve, the fitted parameters and the columns `beside`.
+
+    Parameters
+    ----------
+    make : the cause of a pattern. solve : groups of columns (m, c) with a unit prior each to their amplitudes.
+    """
+    placed = tuple(placed)
+    for _ in range(ROUNDS):
+        cause = make(placed)
+        sizes = cause.sizes(cause.grid[0])
+        columns = at.columns(cause, cause.grid[0]) * sizes
+        values = sizes * solve([columns, *beside])[0]
+        slopes = np.stack([_slope(placed, k, make, at, values) for k in range(1, len(placed))], axis=1)
+        steps = solve([columns, *beside, slopes * LARGEST_TURN])[-1] * LARGEST_TURN
+        steps = np.clip(steps, -LARGEST_TURN, LARGEST_TURN)
+        moved = [replace(p, shift=float(p.shift + d)) for p, d in zip(placed[1:], steps, strict=True)]
+        placed = (placed[0], *moved)
+        if float(np.max(np.abs(steps))) < STEP:
+            break
+    return placed
+
+
+def _slope(
+    placed: tuple[Placed, ...], k: int, make: Callable[[Sequence[Placed]], RobotCause], at: Tangents, values: Array
+) -> Array:
+    """Derivative (m,) of what a curve with given amplitudes adds by the turn of one joint."""
+    ends = [make((replace(placed[k], shift=placed[k].shift + side * STEP),)) for side in (1.0, -1.0)]
+    ahead, behind = (at.columns(cause, cause.grid[0]) @ values for cause in ends)
+    return np.asarray((ahead - behind) / (2.0 * STEP))
+
+
+def maker(bumps: int, variables: dict[str, Array], count: int) -> Callable[[Sequence[Placed]], RobotCause]:
+    """The cause of a pattern with so many bumps a turn; count : number of the robot's turning joints."""
+
+    def make(placed: Sequence[Placed]) -> RobotCause:
+        angles = variables[f"q{placed[0].joint.number}"]
+        return shared_curve(placed, angles, bumps, len(placed) == count)
+
+    return make
