@@ -35,7 +35,7 @@ from robcal.imaging.cramer_rao import centre_bound
 from robcal.imaging.detect import detect_targets
 from robcal.imaging.detections import Detections
 from robcal.imaging.noise import NoiseModel
-from robcal.imaging.other_centroids import contour_centres, grey_centroids
+from robcal.imaging.other_centroids import contour_centres, crop_around
 from robcal.imaging.settings import DetectionSettings
 
 Array = NDArray[np.float64]
@@ -43,6 +43,25 @@ Array = NDArray[np.float64]
 _BLUR = 0.7
 _SUB = 8
 _CODED_BELOW = 1000  # ids of uncoded dots in fixtures begin there
+
+
+def grey_centroids(image: NDArray, xy: Array, semi_axes: Array, background: Array) -> Array:
+    """(n, 2) centres of gravity of the grey values above a tenth of the contrast.
+
+    Parameters
+    ----------
+    image : (h, w), bright dots. xy : (n, 2) places. semi_axes : (n, 2). background : (n,) grey values.
+    """
+    result = np.full((len(xy), 2), np.nan)
+    for row, place in enumerate(np.asarray(xy, dtype=float)):
+        crop, x0, y0 = crop_around(image, place, int(np.ceil(semi_axes[row].max() + 3.0)))
+        weight = crop - background[row]
+        weight = np.where(weight > 0.1 * weight.max(), weight, 0.0)
+        total = weight.sum()
+        if total > 0:
+            rows, columns = np.indices(crop.shape)
+            result[row] = x0 + (weight * columns).sum() / total, y0 + (weight * rows).sum() / total
+    return result
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,8 @@ from typing import Annotated, Any
 import typer
 
 from pipeline.cell_commands import cell
-from pipeline.command_line import CampaignPath, Json, Quiet, RunFolder, Workers, answers, wrong_use
+from pipeline.command_line import CampaignPath, InstrumentName, Json, Quiet, RunFolder, Workers, answers, wrong_use
+from pipeline.drift_commands import app as drift_app
 from pipeline.mastering_commands import mastering
 from pipeline.messages import LOG
 
@@ -23,7 +24,13 @@ app = typer.Typer(
     help="From photographs to an accurate robot: survey, measurement, identification, diagnosis, compensation.",
 )
 app.add_typer(cell, name="cell")
+app.add_typer(drift_app, name="drift")
 app.add_typer(mastering)
+
+RunOrDrift = Annotated[
+    Path, typer.Argument(metavar="RUN", help="Run folder of a finished campaign, or state of a drift control.")
+]
+AtCycle = Annotated[int | None, typer.Option("--at-cycle", help="Of a drift control: the model of an earlier cycle.")]
 
 
 def _check_stages(start: str | None, until: str | None) -> None:
@@ -107,12 +114,14 @@ def diagnose(
 
 @app.command(short_help="Where the calibrated robot's tool really is.")
 def predict(
-    run_folder: RunFolder,
+    run_folder: RunOrDrift,
     poses: Annotated[Path, typer.Option("--poses", help="Joint angles: pose, q1_deg, ... as in poses.csv.")],
     out: Annotated[Path, typer.Option("--out", help="Table of frames to write.")],
     nominal: Annotated[
         bool, typer.Option("--nominal", help="The uncalibrated robot after the best cell calibration.")
     ] = False,
+    instrument: InstrumentName = None,
+    at_cycle: AtCycle = None,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
@@ -120,7 +129,7 @@ def predict(
     with answers("predict", as_json, quiet) as answer:
         from pipeline.prediction import predict_run
 
-        answer.update(predict_run(run_folder, poses, out, nominal=nominal))
+        answer.update(predict_run(run_folder, poses, out, nominal=nominal, instrument=instrument, at_cycle=at_cycle))
         for sentence in answer["warnings"]:
             LOG.warning(sentence)
         LOG.info(f"{answer['poses']} frames in {out}")
@@ -128,7 +137,7 @@ def predict(
 
 @app.command(short_help="Commands that bring the tool where it should be.")
 def compensate(
-    run_folder: RunFolder,
+    run_folder: RunOrDrift,
     frames: Annotated[Path, typer.Option("--frames", help="Wanted tool frames; column payload if loads differ.")],
     out: Annotated[Path, typer.Option("--out", help="Table of joint angles (or targets) to write.")],
     kind: Annotated[str, typer.Option("--as", metavar="joints|frames", help="Joint angles, or targets F*.")] = "joints",
@@ -142,6 +151,8 @@ def compensate(
     skip: Annotated[
         bool, typer.Option("--skip-unreachable", help="Leave out frames that the robot cannot reach.")
     ] = False,
+    instrument: InstrumentName = None,
+    at_cycle: AtCycle = None,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
@@ -158,7 +169,15 @@ def compensate(
         targets, in_base = kind == "frames", system == "base"
         answer.update(
             compensate_run(
-                run_folder, frames, out, as_frames=targets, in_base=in_base, skip_unreachable=skip, program=program
+                run_folder,
+                frames,
+                out,
+                as_frames=targets,
+                in_base=in_base,
+                skip_unreachable=skip,
+                program=program,
+                instrument=instrument,
+                at_cycle=at_cycle,
             )
         )
         for sentence in answer["warnings"]:
@@ -215,9 +234,10 @@ def poses(
 
 @app.command(short_help="C99 and URDF of the calibrated robot.")
 def export(
-    run_folder: RunFolder,
+    run_folder: RunOrDrift,
     c: Annotated[Path | None, typer.Option("--c", help="Folder for C99 source of the model and its inverse.")] = None,
     urdf: Annotated[Path | None, typer.Option("--urdf", help="URDF file of the calibrated robot.")] = None,
+    at_cycle: AtCycle = None,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
@@ -227,7 +247,7 @@ def export(
     with answers("export", as_json, quiet) as answer:
         from pipeline.exports import export_run
 
-        written = export_run(run_folder, c, urdf)
+        written = export_run(run_folder, c, urdf, at_cycle)
         answer["files"] = [str(path) for path in written]
         for path in written:
             LOG.info(str(path))

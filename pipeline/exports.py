@@ -2,21 +2,20 @@
 
 from pathlib import Path
 
-from pipeline.runs import open_run
-from pipeline.stages.identify import load_calibrated
+from pipeline.robot_in_force import robot_in_force
 from robcal.files.storage import write_text
 from robcal.robot.export.c_export import export_c
 from robcal.robot.export.urdf import urdf_text
 
 
-def export_run(folder: Path, c: Path | None, urdf: Path | None) -> list[Path]:
+def export_run(folder: Path, c: Path | None, urdf: Path | None, at_cycle: int | None = None) -> list[Path]:
     """Write the wanted exports; returns the files.
 
     Raises
     ------
     InvalidInput : no calibrated robot in the run, or a model that has no counterpart in the format.
     """
-    calibrated = load_calibrated(open_run(folder))
+    calibrated = robot_in_force(folder, at_cycle)
     written: list[Path] = []
     if c is not None:
         source = export_c(calibrated.model, statics=calibrated.statics, defaults=calibrated.defaults)

@@ -246,10 +246,6 @@ class Run:
         """result.json"""
         write_json(self.result, data)
 
-    def load_result(self) -> dict[str, Any]:
-        """Content of result.json."""
-        return read_json(self.result)
-
     @contextmanager
     def lock(self) -> Iterator[None]:
         """Hold the run folder for this process; released by the system even after kill -9.

@@ -10,7 +10,20 @@ from pipeline.report.evidence_plots import evidence_figure
 from pipeline.report.image_cause_plots import gains_figure, lens_figure
 from pipeline.report.material import Material
 from pipeline.report.robot_plot import robot_figure
-from pipeline.report.style import AFTER, BEFORE, GREY, label, layout, number, percent, probability, rounded, to_sigma
+from pipeline.report.style import (
+    AFTER,
+    BEFORE,
+    GREY,
+    label,
+    layout,
+    level_line,
+    number,
+    percent,
+    probability,
+    rounded,
+    to_sigma,
+    trace,
+)
 from robcal.calibration.observations import PointObservations
 from robcal.photogrammetry.core.camera import Camera
 from robcal.photogrammetry.station.contradictions import LENS_RADIAL
@@ -220,22 +233,12 @@ def _gain(material: Material, d: Mapping[str, Any]) -> list[Block]:
         order = np.argsort(-evidence.before, kind="stable")[:80]
         names = [label(evidence.poses[i]) for i in order]
         data = tuple(
-            {"type": "bar", "x": names, "y": rounded(values[order] * 1e3), "name": name, "marker": {"color": colour}}
+            trace("bar", (names, rounded(values[order] * 1e3)), name, marker={"color": colour})
             for name, values, colour in (("before", evidence.before, BEFORE), ("after", evidence.after, AFTER))
         )
         lines, notes = [], []
         if floor:
-            lines.append(
-                {
-                    "type": "line",
-                    "xref": "paper",
-                    "x0": 0,
-                    "x1": 1,
-                    "y0": floor,
-                    "y1": floor,
-                    "line": {"color": GREY, "dash": "dash"},
-                }
-            )
+            lines.append(level_line("y", floor))
             notes.append(
                 {
                     "xref": "paper",

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.report.blocks import Figure
-from pipeline.report.style import ACCENT, AFTER, BEFORE, GREEN, GREY, INK, label, layout, rounded
+from pipeline.report.style import ACCENT, AFTER, BEFORE, GREEN, GREY, INK, label, layout, rounded, trace
 from robcal.recipe.evidence import CauseEvidence
 from robcal.transforms import Array
 
@@ -31,26 +31,13 @@ def evidence_figure(evidence: CauseEvidence, cause: str) -> Figure:
         means = _means(x[which], evidence.measured[which] * factor, evidence.sigma[which] * factor)
         if means is not None:
             data.append(
-                {
-                    "type": "scatter",
-                    "mode": "markers",
-                    "x": rounded(means[0]),
-                    "y": rounded(means[1]),
-                    "error_y": {
-                        "type": "data",
-                        "array": rounded(means[2]),
-                        "color": colour,
-                        "thickness": 2,
-                        "width": 4,
-                    },
-                    "marker": {
-                        "color": colour,
-                        "size": 11,
-                        "line": {"color": "#fff", "width": 1.5},
-                        "symbol": "square",
-                    },
-                    "name": f"mean of neighbours{told}",
-                }
+                trace(
+                    "scatter markers",
+                    (rounded(means[0]), rounded(means[1])),
+                    f"mean of neighbours{told}",
+                    error_y={"type": "data", "array": rounded(means[2]), "color": colour, "thickness": 2, "width": 4},
+                    marker={"color": colour, "size": 11, "line": {"color": "#fff", "width": 1.5}, "symbol": "square"},
+                )
             )
     data += _law(evidence, x, factor)
     label_y = f"{what} ({unit})" if unit else what
@@ -106,24 +93,22 @@ def abscissa(name: str, values: Array) -> tuple[Array, str]:
 def _points(
     e: CauseEvidence, mine: Array, x: Array, factor: float, colour: str, symbol: str, name: str, unit: str
 ) -> dict[str, Any]:
-    return {
-        "type": "scatter",
-        "mode": "markers",
-        "x": rounded(x[mine]),
-        "y": rounded(e.measured[mine] * factor),
-        "error_y": {
+    return trace(
+        "scatter markers",
+        (rounded(x[mine]), rounded(e.measured[mine] * factor)),
+        name,
+        error_y={
             "type": "data",
             "array": rounded(e.sigma[mine] * factor),
             "color": colour,
             "thickness": 0.6,
             "width": 0,
         },
-        "marker": {"color": colour, "size": 6, "symbol": symbol, "opacity": 0.55},
-        "name": name,
-        "text": [label(p) for p, m in zip(e.poses, mine, strict=True) if m],
-        "hovertemplate": "%{text}: %{y:.4g} " + unit + "<extra></extra>",
-        "showlegend": symbol == "circle",
-    }
+        marker={"color": colour, "size": 6, "symbol": symbol, "opacity": 0.55},
+        text=[label(p) for p, m in zip(e.poses, mine, strict=True) if m],
+        hovertemplate="%{text}: %{y:.4g} " + unit + "<extra></extra>",
+        showlegend=symbol == "circle",
+    )
 
 
 def _means(x: Array, y: Array, sigma: Array) -> tuple[Array, Array, Array] | None:
@@ -160,27 +145,16 @@ def _law(e: CauseEvidence, x: Array, factor: float) -> list[dict[str, Any]]:
         told = f"fitted law, {_STATES[float(state)][1]}" if state else "fitted law"
         colour = _STATES[float(state)][0] if state else ACCENT
         line = {"color": INK if not state else colour, "width": 3, "dash": dashes[k % 3]}
-        out.append(
-            {
-                "type": "scatter",
-                "mode": "lines",
-                "x": rounded(shown, 5),
-                "y": rounded(value * factor),
-                "name": told,
-                "line": line,
-            }
-        )
+        out.append(trace("scatter lines", (rounded(shown, 5), rounded(value * factor)), told, line=line))
     if not out:
         order = np.argsort(x, kind="stable")
         mark = {"color": GREEN, "symbol": "line-ew-open", "size": 12, "line": {"width": 2.5}}
         out.append(
-            {
-                "type": "scatter",
-                "mode": "markers",
-                "x": rounded(x[order]),
-                "y": rounded(e.fitted[order] * factor),
-                "name": "fitted law at the pose",
-                "marker": mark,
-            }
+            trace(
+                "scatter markers",
+                (rounded(x[order]), rounded(e.fitted[order] * factor)),
+                "fitted law at the pose",
+                marker=mark,
+            )
         )
     return out

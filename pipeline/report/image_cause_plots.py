@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.report.blocks import Figure
-from pipeline.report.style import AFTER, BEFORE, GREY, label, layout, number, rounded
+from pipeline.report.style import AFTER, BEFORE, label, layout, level_line, number, rounded, trace
 from robcal.photogrammetry.core.camera import INTRINSIC_NAMES, Camera
 from robcal.transforms import Array
 
@@ -41,22 +41,10 @@ def lens_figure(name: str, camera: Camera, covariance: Array, marks: Array) -> F
             "name": "two sigma",
             "showlegend": True,
         },
-        {
-            "type": "scatter",
-            "mode": "lines",
-            "x": x,
-            "y": rounded(shift),
-            "name": "identified",
-            "line": {"color": AFTER, "width": 3},
-        },
-        {
-            "type": "scatter",
-            "mode": "lines",
-            "x": [x[0], x[-1]],
-            "y": [0, 0],
-            "name": "camera file",
-            "line": {"color": BEFORE, "width": 2, "dash": "dash"},
-        },
+        trace("scatter lines", (x, rounded(shift)), "identified", line={"color": AFTER, "width": 3}),
+        trace(
+            "scatter lines", ([x[0], x[-1]], [0, 0]), "camera file", line={"color": BEFORE, "width": 2, "dash": "dash"}
+        ),
     ]
     told = f"Radial distortion of {label(name)} out to the outermost target: the camera file has none, the images do."
     return Figure(
@@ -78,32 +66,21 @@ def gains_figure(
         return None
     y = [f"{k}. {label(n)}" for k, (n, _) in enumerate(held, 1)]
     data = tuple(
-        {
-            "type": "bar",
-            "orientation": "h",
-            "y": y,
-            "x": rounded([h[kind] for _, h in held]),
-            "name": name,
-            "marker": {"color": colour},
-            "text": [number(h[kind]) for _, h in held],
-            "textposition": "outside",
-            "cliponaxis": False,
-        }
+        trace(
+            "bar",
+            (rounded([h[kind] for _, h in held]), y),
+            name,
+            orientation="h",
+            marker={"color": colour},
+            text=[number(h[kind]) for _, h in held],
+            textposition="outside",
+            cliponaxis=False,
+        )
         for kind, name, colour in (("after", "with it", AFTER), ("before", "without it", BEFORE))
     )
     shapes = []
     if floor:
-        shapes = [
-            {
-                "type": "line",
-                "yref": "paper",
-                "y0": 0,
-                "y1": 1,
-                "x0": floor,
-                "x1": floor,
-                "line": {"color": GREY, "dash": "dash"},
-            }
-        ]
+        shapes = [level_line("x", floor)]
     return Figure(
         data,
         layout(

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pipeline.artifacts import detections
 from pipeline.report.blocks import Block, Chapter, Figure, Picture, Pictures, table
 from pipeline.report.material import Material
-from pipeline.report.style import AFTER, GREY, label, layout, number
+from pipeline.report.style import AFTER, GREY, label, layout, number, trace
 from robcal.errors import RobcalError
 from robcal.files.images import read_image
 from robcal.imaging.detections import CodeState, Detections
@@ -180,25 +180,21 @@ def _vectors(name: str, xy: Array, residual: Array, size: tuple[int, int]) -> Fi
         ay += [round(float(a[1]), 1), round(float(b[1]), 1), None]
     told = [f"{c} marks, mean {number(m[0], 2)}, {number(m[1], 2)} px" for c, m in zip(counts, means, strict=True)]
     data: tuple[Mapping[str, object], ...] = (
-        {
-            "type": "scatter",
-            "mode": "lines",
-            "x": x,
-            "y": y,
-            "name": f"residuals x {magnification:g}",
-            "line": {"color": GREY, "width": 1},
-            "hoverinfo": "skip",
-            "opacity": 0.55,
-        },
-        {
-            "type": "scatter",
-            "mode": "lines",
-            "x": ax,
-            "y": ay,
-            "name": f"mean of a region x {2 * magnification:g}",
-            "line": {"color": AFTER, "width": 3},
-            "hoverinfo": "skip",
-        },
+        trace(
+            "scatter lines",
+            (x, y),
+            f"residuals x {magnification:g}",
+            line={"color": GREY, "width": 1},
+            hoverinfo="skip",
+            opacity=0.55,
+        ),
+        trace(
+            "scatter lines",
+            (ax, ay),
+            f"mean of a region x {2 * magnification:g}",
+            line={"color": AFTER, "width": 3},
+            hoverinfo="skip",
+        ),
         {
             "type": "scatter",
             "mode": "markers",

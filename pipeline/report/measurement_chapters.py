@@ -4,7 +4,7 @@ import numpy as np
 
 from pipeline.report.blocks import Block, Chapter, Figure, Text, table
 from pipeline.report.material import Material
-from pipeline.report.style import ACCENT, AFTER, GREY, layout, number, rounded
+from pipeline.report.style import ACCENT, AFTER, layout, level_line, number, rounded, trace
 from robcal.photogrammetry.measure.frames import MeasuredFrames, PairDeviations
 
 
@@ -37,19 +37,15 @@ def _lengths(pairs: PairDeviations) -> Figure:
             continue
         counts, _ = np.histogram(np.clip(deviation[which], -top, top), edges)
         data.append(
-            {
-                "type": "bar",
-                "x": rounded(0.5 * (edges[1:] + edges[:-1])),
-                "y": counts.tolist(),
-                "name": name,
-                "width": float(edges[1] - edges[0]),
-                "marker": {"color": colour},
-            }
+            trace(
+                "bar",
+                (rounded(0.5 * (edges[1:] + edges[:-1])), counts.tolist()),
+                name,
+                width=float(edges[1] - edges[0]),
+                marker={"color": colour},
+            )
         )
-    lines = [
-        {"type": "line", "yref": "paper", "y0": 0, "y1": 1, "x0": x, "x1": x, "line": {"color": GREY, "dash": "dash"}}
-        for x in (-limit, limit)
-    ]
+    lines = [level_line("x", x) for x in (-limit, limit)]
     beyond = int(np.sum(np.abs(deviation) > top))
     clipped = f" {beyond} beyond the plot are counted in the outermost bars." if beyond else ""
     return Figure(

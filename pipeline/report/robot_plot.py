@@ -6,7 +6,7 @@ import numpy as np
 
 from pipeline.report.blocks import Figure
 from pipeline.report.material import Material
-from pipeline.report.style import ACCENT, AFTER, GREEN, INK, label, rounded, scene
+from pipeline.report.style import ACCENT, AFTER, GREEN, INK, label, rounded, scene, trace
 from robcal.robot.chain import Chain, chain_of, cumulative_motions
 from robcal.robot.model import RobotModel
 from robcal.transforms import Array, invert
@@ -92,32 +92,26 @@ def _place(
 
 
 def _line(points: Array, name: str, colour: str, width: int) -> dict[str, Any]:
-    return {
-        "type": "scatter3d",
-        "mode": "lines",
-        "x": rounded(points[:, 0], 5),
-        "y": rounded(points[:, 1], 5),
-        "z": rounded(points[:, 2], 5),
-        "name": label(name),
-        "line": {"color": colour, "width": width},
-        "hoverinfo": "skip",
-        "showlegend": False,
-    }
+    return trace(
+        "scatter3d lines",
+        (rounded(points[:, 0], 5), rounded(points[:, 1], 5), rounded(points[:, 2], 5)),
+        label(name),
+        line={"color": colour, "width": width},
+        hoverinfo="skip",
+        showlegend=False,
+    )
 
 
 def _dots(points: Array, name: str, colour: str, size: float, text: list[str] | None = None) -> dict[str, Any]:
-    return {
-        "type": "scatter3d",
-        "mode": "markers",
-        "x": rounded(points[:, 0], 5),
-        "y": rounded(points[:, 1], 5),
-        "z": rounded(points[:, 2], 5),
-        "name": label(name),
-        "marker": {"color": colour, "size": size},
-        "text": [label(t) for t in text or [name] * len(points)],
-        "hovertemplate": "%{text}<extra></extra>",
-        "showlegend": False,
-    }
+    return trace(
+        "scatter3d markers",
+        (rounded(points[:, 0], 5), rounded(points[:, 1], 5), rounded(points[:, 2], 5)),
+        label(name),
+        marker={"color": colour, "size": size},
+        text=[label(t) for t in text or [name] * len(points)],
+        hovertemplate="%{text}<extra></extra>",
+        showlegend=False,
+    )
 
 
 def _note(data: list[dict[str, Any]], name: str) -> dict[str, Any]:

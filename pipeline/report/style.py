@@ -1,7 +1,7 @@
 """Colours and layouts of the plots: the palette of Okabe and Ito (2008), told apart by all kinds of colour vision."""
 
 import html
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,6 @@ GREY = "#8A929C"
 INK = "#1F2933"
 GRID = "#E4E7EB"
 CATEGORIES = (AFTER, BEFORE, GREEN, PURPLE, SKY, ACCENT, "#6B7280", "#B8A200")
-SYMBOLS = ("circle", "diamond", "square", "triangle-up", "cross", "x")
 
 
 def label(text: object) -> str:
@@ -93,6 +92,20 @@ def _ranges(data: list[Mapping[str, Any]]) -> np.ndarray:
     half = 0.5 * np.maximum(span * 1.1, least)
     middle = ranges.mean(axis=1)
     return np.stack([middle - half, middle + half], axis=1)
+
+
+def trace(form: str, coordinates: Sequence[Any], name: str, **more: Any) -> dict[str, Any]:
+    """A trace of a plot: Plotly's type and mode (``"scatter lines"``, ``"bar"``), x, y (and z), its other entries."""
+    kind, _, mode = form.partition(" ")
+    head = {"type": kind, "mode": mode} if mode else {"type": kind}
+    return {**head, **dict(zip("xyz", coordinates, strict=False)), "name": name, **more}
+
+
+def level_line(axis: str, value: object) -> dict[str, Any]:
+    """A dashed line across the whole plot at a value of ``axis``, "x" or "y"."""
+    other = "y" if axis == "x" else "x"
+    ends = {f"{axis}0": value, f"{axis}1": value, f"{other}0": 0, f"{other}1": 1}
+    return {"type": "line", f"{other}ref": "paper", **ends, "line": {"color": GREY, "dash": "dash"}}
 
 
 def percent(share: float) -> str:

@@ -4,7 +4,7 @@ import numpy as np
 
 from pipeline.report.blocks import Block, Chapter, Figure, Table, Text, table
 from pipeline.report.material import Material
-from pipeline.report.style import ACCENT, AFTER, BEFORE, CATEGORIES, GREEN, GREY, label, number, rounded, scene
+from pipeline.report.style import ACCENT, AFTER, BEFORE, CATEGORIES, GREEN, GREY, label, number, rounded, scene, trace
 from robcal.photogrammetry.core.camera import INTRINSIC_NAMES, Camera
 from robcal.photogrammetry.core.network import CameraNetwork, LengthResult
 from robcal.photogrammetry.station.network import StationOrientation
@@ -163,30 +163,20 @@ def _camera_lines(world_T_camera: Array, size: float) -> tuple[list[float | None
 
 
 def _lines(xyz: tuple[list[float | None], ...], name: str, colour: str, width: int = 2) -> dict[str, object]:
-    return {
-        "type": "scatter3d",
-        "mode": "lines",
-        "x": xyz[0],
-        "y": xyz[1],
-        "z": xyz[2],
-        "name": name,
-        "line": {"color": colour, "width": width},
-        "hoverinfo": "skip",
-    }
+    return trace(
+        "scatter3d lines", (xyz[0], xyz[1], xyz[2]), name, line={"color": colour, "width": width}, hoverinfo="skip"
+    )
 
 
 def _dots(points: Array, text: list[str], name: str, colour: str, size: float = 3) -> dict[str, object]:
-    return {
-        "type": "scatter3d",
-        "mode": "markers",
-        "x": rounded(points[:, 0], 6),
-        "y": rounded(points[:, 1], 6),
-        "z": rounded(points[:, 2], 6),
-        "name": name,
-        "text": [label(t) for t in text],
-        "marker": {"size": size, "color": colour},
-        "hovertemplate": "%{text}<extra>" + label(name) + "</extra>",
-    }
+    return trace(
+        "scatter3d markers",
+        (rounded(points[:, 0], 6), rounded(points[:, 1], 6), rounded(points[:, 2], 6)),
+        name,
+        text=[label(t) for t in text],
+        marker={"size": size, "color": colour},
+        hovertemplate="%{text}<extra>" + label(name) + "</extra>",
+    )
 
 
 def _network(name: str, network: CameraNetwork) -> Figure:

@@ -6,7 +6,7 @@ import numpy as np
 
 from pipeline.report.blocks import Block, Chapter, Figure, Table, Text, table
 from pipeline.report.material import Material
-from pipeline.report.style import AFTER, BEFORE, GREY, label, layout, number, percent, probability, rounded
+from pipeline.report.style import AFTER, BEFORE, label, layout, level_line, number, percent, probability, rounded, trace
 from robcal.calibration.observations import FrameObservations
 from robcal.calibration.verification import TEST_VECTORS, Verification
 from robcal.transforms import Array, skew
@@ -149,14 +149,13 @@ def _bars(v: Verification, names: list[str]) -> Figure:
 def _bar(x: list[str], y: Array, name: str, colour: str) -> dict[str, object]:
     # several points of one pose follow one another: each gets a bar of its own place
     x = x if len(x) == len(y) else [str(i + 1) for i in range(len(y))]
-    return {
-        "type": "bar",
-        "x": x,
-        "y": rounded(y),
-        "name": name,
-        "marker": {"color": colour},
-        "hovertemplate": "%{x}: %{y:.3f} mm<extra>" + name + "</extra>",
-    }
+    return trace(
+        "bar",
+        (x, rounded(y)),
+        name,
+        marker={"color": colour},
+        hovertemplate="%{x}: %{y:.3f} mm<extra>" + name + "</extra>",
+    )
 
 
 def _histogram(v: Verification) -> Figure:
@@ -173,15 +172,14 @@ def _histogram(v: Verification) -> Figure:
         for name, errors, colour in groups:
             counts, _ = np.histogram(np.clip(errors[tool] * 1000, edges[0], edges[-1]), edges)
             data.append(
-                {
-                    "type": "bar",
-                    "x": rounded(np.sqrt(edges[1:] * edges[:-1])),
-                    "y": counts.tolist(),
-                    "width": rounded(np.diff(edges)),
-                    "name": f"{name}, {_tool(tool, v)}",
-                    "marker": {"color": colour, "opacity": 0.8, "line": {"width": 0.5, "color": "#fff"}},
-                    "visible": True if k == 0 else "legendonly",
-                }
+                trace(
+                    "bar",
+                    (rounded(np.sqrt(edges[1:] * edges[:-1])), counts.tolist()),
+                    f"{name}, {_tool(tool, v)}",
+                    width=rounded(np.diff(edges)),
+                    marker={"color": colour, "opacity": 0.8, "line": {"width": 0.5, "color": "#fff"}},
+                    visible=True if k == 0 else "legendonly",
+                )
             )
     more = "; other tool points by a click in the legend" if len(v.errors) > 1 else ""
     return Figure(
@@ -225,19 +223,15 @@ def _calibration_of_uncertainty(v: Verification, names: list[str]) -> Figure:
     size = np.sqrt(v.normalised)
     x = [label(n) for n in names] if len(names) == len(size) else list(range(len(size)))
     data = [
-        {
-            "type": "scatter",
-            "mode": "markers",
-            "x": x,
-            "y": rounded(size),
-            "name": "pose",
-            "marker": {"color": AFTER, "size": 8},
-            "hovertemplate": "%{x}: %{y:.2f}<extra></extra>",
-        }
+        trace(
+            "scatter markers",
+            (x, rounded(size)),
+            "pose",
+            marker={"color": AFTER, "size": 8},
+            hovertemplate="%{x}: %{y:.2f}<extra></extra>",
+        )
     ]
-    lines = [
-        {"type": "line", "xref": "paper", "x0": 0, "x1": 1, "y0": 1, "y1": 1, "line": {"color": GREY, "dash": "dash"}}
-    ]
+    lines = [level_line("y", 1)]
     return Figure(
         tuple(data),
         layout(

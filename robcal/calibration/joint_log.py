@@ -38,11 +38,6 @@ class JointLog:
     def __len__(self) -> int:
         return len(self.names)
 
-    @property
-    def approach_inferred(self) -> bool:
-        """Whether any approach direction was taken from the order of the poses."""
-        return bool(self.inferred)
-
     def as_stated(self) -> "JointLog":
         """The log without what was inferred: approach 0 where no column states it, as for poses to predict."""
         approach = self.approach.copy()

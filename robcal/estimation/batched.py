@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from robcal.columns import Columns
 from robcal.estimation.grouping import Array, IntArray, sum_by
 from robcal.estimation.summary import TerminationSettings
 
@@ -21,7 +22,7 @@ _AFTER_REJECTION = 1e-3
 
 
 @dataclass(frozen=True)
-class NormalEquations:
+class NormalEquations(Columns):
     """Normal equations of n problems: ``matrix`` (n, p, p), ``right`` (n, p), ``cost`` (n,) sums of squares."""
 
     matrix: Array
@@ -42,15 +43,6 @@ class NormalEquations:
         cost = sum_by(group, np.sum(r**2, axis=1), n)
         cost[group[~finite]] = np.inf
         return cls(matrix, right, cost)
-
-    def take(self, rows: IntArray | NDArray[np.bool_]) -> "NormalEquations":
-        """The chosen problems."""
-        return NormalEquations(self.matrix[rows], self.right[rows], self.cost[rows])
-
-    def put(self, rows: IntArray, other: "NormalEquations", chosen: NDArray[np.bool_]) -> None:
-        """The chosen problems of another system into ``rows`` of this one, in place."""
-        self.matrix[rows], self.right[rows] = other.matrix[chosen], other.right[chosen]
-        self.cost[rows] = other.cost[chosen]
 
     def inverse(self) -> Array:
         """(n, p, p) covariances; NaN where a problem is singular."""
@@ -124,7 +116,7 @@ def minimise_each(
     active, steps = rows[~converged], 0
     while len(active) and steps < settings.max_iterations:
         steps += 1
-        now = best.take(active)
+        now = best.select(active)
         step = solve(now, factor[active])
         predicted = np.einsum("np,np->n", step, 2.0 * now.right - (now.matrix @ step[..., None])[..., 0])
         trial = retract(x[active], step)

@@ -30,16 +30,6 @@ def geman_mcclure_costs(length: Array) -> Array:
     return 1.0 - 1.0 / (1.0 + np.where(np.isfinite(length), length, np.inf) ** 2)
 
 
-def cauchy_weights(length: Array) -> Array:
-    """Weights of residuals of these lengths (m,), in units of the width of Cauchy's distribution."""
-    return 1.0 / (1.0 + length**2)
-
-
-def cauchy_costs(length: Array) -> Array:
-    """Costs (m,), growing with the logarithm of the length."""
-    return np.log1p(length**2)
-
-
 def median_scale(r: Array) -> float:
     """Standard deviation of a coordinate from the median length of residual vectors in the plane (m, 2)."""
     # the length of a standard normal vector in the plane has the median sqrt(2 ln 2)

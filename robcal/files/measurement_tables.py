@@ -118,7 +118,7 @@ def read_measurements(path: Path, pose_names: Sequence[str], kind: Kind | None =
         covariance = _frame_covariance(table, six)
     else:
         values = np.column_stack([table.numbers(f"{n}_mm") for n in SIX[:3]]) / 1000
-        covariance = _point_covariance(table)
+        covariance = point_covariance(table)
     _check_size(table, values)
     covariates = {name: table.numbers(name) for name in ("cycle", "time_s") if table.has(name)}
     angles = six[:, 3:] if kind == "frames" else None
@@ -208,7 +208,8 @@ def _target_ids(table: Table) -> IntArray:
     return table.whole_numbers("target")
 
 
-def _point_covariance(table: Table) -> Array | None:
+def point_covariance(table: Table) -> Array | None:
+    """Covariance (m, 3, 3) in m2 that a table of points states, None where it states none."""
     full = ("sxx_mm2", "sxy_mm2", "sxz_mm2", "syy_mm2", "syz_mm2", "szz_mm2")
     some = [name for name in full if table.has(name)]
     if some and len(some) < len(full):

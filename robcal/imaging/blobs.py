@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from robcal.columns import Columns
 from robcal.imaging.detections import Reason
 from robcal.imaging.settings import DetectionSettings
 
@@ -16,7 +17,7 @@ _ROUGH_PIXELS = 40_000  # pixels of a part that are enough to estimate its noise
 
 
 @dataclass(frozen=True)
-class Candidates:
+class Candidates(Columns):
     """Blobs that may be dots, n of them, from moments of their pixels: a start for the fit.
 
     Attributes
@@ -35,18 +36,6 @@ class Candidates:
 
     def __len__(self) -> int:
         return len(self.xy)
-
-    def take(self, chosen: NDArray) -> "Candidates":
-        """The chosen rows."""
-        return Candidates(
-            self.xy[chosen],
-            self.semi_axes[chosen],
-            self.angle[chosen],
-            self.base[chosen],
-            self.peak[chosen],
-            self.blur[chosen],
-            self.nodes_exhausted,
-        )
 
 
 def judge(

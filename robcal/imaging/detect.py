@@ -59,11 +59,11 @@ def detect_targets(image: NDArray, settings: DetectionSettings = _DEFAULT) -> De
     candidates = find_candidates(bright, bright_noise, settings, log)
     candidates = _standing_out(bright, candidates, bright_noise, settings, log)
     late = may_be_ring_parts(candidates) if settings.ring12 else np.zeros(len(candidates), bool)
-    dots, bright_noise, _ = fit_dots(bright, candidates.take(~late), bright_noise, saturation, settings.max_misfit)
+    dots, bright_noise, _ = fit_dots(bright, candidates.select(~late), bright_noise, saturation, settings.max_misfit)
     log.count(Reason.SHAPE, int((~late).sum()) - len(dots))
     dots = accept(dots, bright, bright_noise, settings, log)
     readings, dots = _read(bright, dots, bright_noise, saturation, settings)
-    waiting = without_ring_parts(candidates.take(late), dots, readings, log)
+    waiting = without_ring_parts(candidates.select(late), dots, readings, log)
     if len(waiting):
         more, _, _ = fit_dots(bright, waiting, bright_noise, saturation, settings.max_misfit)
         more = accept(more, bright, bright_noise, settings, log)
@@ -135,7 +135,7 @@ def _standing_out(
     high = step > _STEP_BY_CONTRAST * settings.min_contrast_sigma * np.sqrt(noise.at(candidates.base))
     for bad, reason in ((~around, Reason.SHAPE), (around & ~high, Reason.CONTRAST)):
         log.add_rows(candidates.xy[bad], candidates.semi_axes[bad, 0], reason)
-    return candidates.take(around & high)
+    return candidates.select(around & high)
 
 
 def saturation_level(image: NDArray) -> float:
@@ -158,7 +158,7 @@ def _read(
     if ringed.size:
         again = refit_ringed(image, dots, readings, ringed, noise, saturation)
         good = again.converged & (np.linalg.norm(again.xy - dots.xy[ringed], axis=1) < 0.5) & ~again.is_spot
-        dots = dots.replaced(ringed[good], again.take(good))
+        dots = dots.replaced(ringed[good], again.select(good))
     return readings, dots
 
 
@@ -188,13 +188,7 @@ def _merged(
     new = _readings(image, more, noise, saturation, settings)
     # what waited because it may be part of a ring carries no code of its own
     new = replace(new, code=np.full(len(more), -1, np.int64))
-    joined = FittedDots(
-        *(np.concatenate([getattr(dots, f), getattr(more, f)]) for f in FittedDots.__dataclass_fields__)
-    )
-    both = RingReadings(
-        *(np.concatenate([getattr(readings, f), getattr(new, f)]) for f in RingReadings.__dataclass_fields__)
-    )
-    return joined, both
+    return dots.joined(more), readings.joined(new)
 
 
 def _columns(
@@ -228,7 +222,7 @@ def _contour_offset(bright: NDArray, dots: FittedDots, settings: DetectionSettin
     offset = np.full(len(dots), np.nan)
     rows = np.flatnonzero(dots.misfit > _DOUBTFUL * settings.max_misfit)
     if rows.size:
-        some = dots.take(rows)
+        some = dots.select(rows)
         centre = contour_centres(bright, some.xy, some.semi_axes, some.background, some.contrast)
         offset[rows] = np.linalg.norm(centre - some.xy, axis=1)
     return offset

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from robcal.columns import Columns
 from robcal.imaging.blobs import Candidates
 from robcal.imaging.edge_model import axes_from_matrix, matrix_from_axes
 from robcal.imaging.ellipse_fit import EllipseFits, iterate, outliers, start
@@ -29,7 +30,7 @@ _SPOT_RATIO, _SPOT_RATIO_ROUND = 1.7, 1.2  # minor semi-axis by s below which a 
 
 
 @dataclass(frozen=True)
-class FittedDots:
+class FittedDots(Columns):
     """Fits of n candidates in columns.
 
     Attributes
@@ -59,19 +60,6 @@ class FittedDots:
 
     def __len__(self) -> int:
         return len(self.xy)
-
-    def take(self, chosen: NDArray) -> "FittedDots":
-        """The chosen rows."""
-        return FittedDots(*(getattr(self, name)[chosen] for name in FittedDots.__dataclass_fields__))
-
-    def replaced(self, rows: NDArray, other: "FittedDots") -> "FittedDots":
-        """A copy with `rows` taken from `other`."""
-        columns = {}
-        for name in FittedDots.__dataclass_fields__:
-            column = getattr(self, name).copy()
-            column[rows] = getattr(other, name)
-            columns[name] = column
-        return FittedDots(**columns)
 
     def as_candidates(self) -> Candidates:
         """The fits as starts for another fit."""
@@ -111,7 +99,7 @@ def refit_ringed(
     The ring blurs into the gap. For round dots of 2.5 to 6 px radius taking it off alone leaves a bias of up to
     0.025 px towards the ring, no correction up to 0.05 px; this one leaves less than 0.008 px.
     """
-    candidates = dots.take(rows).as_candidates()
+    candidates = dots.select(rows).as_candidates()
     groups = gather_windows(image, candidates, saturation, neighbours=False)
     results = []
     for window in groups:
@@ -162,7 +150,7 @@ def _first_round(
         near = (window.radius < 2.0) | (mean_square - 2.0 * expected < (3.0 * max_misfit * contrast) ** 2)
         near = np.flatnonzero(near & _stays(fit, window, candidates))
         if near.size:
-            window, fit = window.take(near), fit.take(near)
+            window, fit = window.select(near), fit.select(near)
             kept_groups.append(window)
             kept_fits.append(iterate(fit, window, noise, 8, tolerance=0.2))
     return kept_groups, kept_fits
@@ -184,7 +172,7 @@ def _finish(fit: EllipseFits, window: Windows, noise: NoiseModel, shading: Array
     dropped = outliers(fit, window)
     dirty = np.flatnonzero(dropped.any(axis=1))
     if dirty.size:
-        again = iterate(fit.take(dirty), window.take(dirty), noise, 6, 0.05, dropped[dirty], prior_blur[dirty])
+        again = iterate(fit.select(dirty), window.select(dirty), noise, 6, 0.05, dropped[dirty], prior_blur[dirty])
         fit = fit.replaced(dirty, again)
     semi_axes, _ = axes_from_matrix(fit.parameters[:, 2:5])
     ratio = semi_axes[:, 1] / np.exp(fit.parameters[:, 5])
@@ -198,7 +186,7 @@ def _as_spots(
     fit: EllipseFits, window: Windows, noise: NoiseModel, rows: NDArray, prior_blur: Array, dropped: NDArray
 ) -> EllipseFits:
     """Replaces the fits of `rows` by Gaussian spots of the same second moments."""
-    chosen, old = window.take(rows), fit.take(rows)
+    chosen, old = window.select(rows), fit.select(rows)
     semi_axes, angle = axes_from_matrix(old.parameters[:, 2:5])
     parameters = old.parameters.copy()
     second = np.sqrt(np.exp(2.0 * parameters[:, 5, None]) + semi_axes**2 / 4.0)

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from robcal.columns import Columns
 from robcal.imaging.edge_model import SHAPE_PARAMETERS, blurred_ellipse, profile_only, spot
 from robcal.imaging.noise import NoiseModel
 from robcal.imaging.windows import Windows
@@ -30,7 +31,7 @@ _COST_DIGITS = 2e-6  # relative accuracy of a cost summed in single precision
 
 
 @dataclass(frozen=True)
-class EllipseFits:
+class EllipseFits(Columns):
     """State of n fits.
 
     Attributes
@@ -50,18 +51,6 @@ class EllipseFits:
     weight: Array
     residual: Array
     shading_sigma: Array
-
-    def take(self, chosen: NDArray) -> "EllipseFits":
-        """The chosen rows."""
-        return EllipseFits(*(getattr(self, name)[chosen] for name in EllipseFits.__dataclass_fields__))
-
-    def replaced(self, rows: NDArray, other: "EllipseFits") -> "EllipseFits":
-        """A copy with `rows` taken from `other`."""
-        columns = {}
-        for name in EllipseFits.__dataclass_fields__:
-            columns[name] = getattr(self, name).copy()
-            columns[name][rows] = getattr(other, name)
-        return EllipseFits(**columns)
 
     def covariance(self) -> Array:
         """(n, 12, 12) inverse of the normal matrices; infinite centre variances where they are singular."""
@@ -134,16 +123,11 @@ def start(shape: Array, base: Array, peak: Array, windows: Windows, is_spot: NDA
 
 
 @dataclass(frozen=True)
-class _System:
+class _System(Columns):
     normal: Array
     right: Array
     cost: Array
     residual: Array
-
-    def put(self, rows: NDArray, other: "_System", chosen: NDArray[np.bool_]) -> None:
-        """The `chosen` rows of another system into `rows`."""
-        self.normal[rows], self.right[rows] = other.normal[chosen], other.right[chosen]
-        self.cost[rows], self.residual[rows] = other.cost[chosen], other.residual[chosen]
 
 
 def _system(
@@ -253,7 +237,7 @@ def iterate(
             active = active[left]
             if active.size == 0:
                 break
-            sub, sub_precision = sub.take(left), sub_precision[left]
+            sub, sub_precision = sub.select(left), sub_precision[left]
     return replace(
         fits,
         parameters=parameters,

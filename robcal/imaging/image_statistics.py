@@ -56,7 +56,7 @@ def noise_inside(
         use = np.flatnonzero(good)
         if use.size == 0:
             continue
-        part, chosen = window.take(use), fit.take(use)
+        part, chosen = window.select(use), fit.select(use)
         model, jacobian = evaluate(chosen.parameters, part, chosen.is_spot)
         inverse = chosen.covariance()
         inverse[~np.isfinite(inverse)] = 0.0

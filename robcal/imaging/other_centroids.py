@@ -1,7 +1,6 @@
-"""Two other centres of a dot, independent of the ellipse fit to grey values: to question it, not to measure with.
+"""Another centre of a dot, independent of the ellipse fit to grey values: to question it, not to measure with.
 
-The grey centroid is biased by shading; contours at half height with an ellipse through them (scikit-image) are good
-to some hundredths of a pixel.
+Contours at half height with an ellipse through them (scikit-image) are good to some hundredths of a pixel.
 """
 
 import numpy as np
@@ -11,30 +10,12 @@ from skimage.measure import EllipseModel, find_contours
 Array = NDArray[np.float64]
 
 
-def _crop(image: NDArray, xy: Array, half: int) -> tuple[Array, int, int]:
+def crop_around(image: NDArray, xy: Array, half: int) -> tuple[Array, int, int]:
+    """The square of the image (h, w) around a place (2,), cut at the border, and x and y of its first pixel."""
     height, width = image.shape
     x, y = round(float(xy[0])), round(float(xy[1]))
     x0, y0 = max(0, x - half), max(0, y - half)
     return image[y0 : min(height, y + half + 1), x0 : min(width, x + half + 1)].astype(float), x0, y0
-
-
-def grey_centroids(image: NDArray, xy: Array, semi_axes: Array, background: Array) -> Array:
-    """(n, 2) centres of gravity of the grey values above a tenth of the contrast.
-
-    Parameters
-    ----------
-    image : (h, w), bright dots. xy : (n, 2) places. semi_axes : (n, 2). background : (n,) grey values.
-    """
-    result = np.full((len(xy), 2), np.nan)
-    for row, place in enumerate(np.asarray(xy, dtype=float)):
-        crop, x0, y0 = _crop(image, place, int(np.ceil(semi_axes[row].max() + 3.0)))
-        weight = crop - background[row]
-        weight = np.where(weight > 0.1 * weight.max(), weight, 0.0)
-        total = weight.sum()
-        if total > 0:
-            rows, columns = np.indices(crop.shape)
-            result[row] = x0 + (weight * columns).sum() / total, y0 + (weight * rows).sum() / total
-    return result
 
 
 def contour_centres(image: NDArray, xy: Array, semi_axes: Array, background: Array, contrast: Array) -> Array:
@@ -46,7 +27,7 @@ def contour_centres(image: NDArray, xy: Array, semi_axes: Array, background: Arr
     """
     result = np.full((len(xy), 2), np.nan)
     for row, place in enumerate(np.asarray(xy, dtype=float)):
-        crop, x0, y0 = _crop(image, place, int(np.ceil(semi_axes[row].max() + 4.0)))
+        crop, x0, y0 = crop_around(image, place, int(np.ceil(semi_axes[row].max() + 4.0)))
         here = place - np.array([x0, y0])
         best: tuple[float, Array] | None = None
         for contour in find_contours(crop, background[row] + 0.5 * contrast[row]):

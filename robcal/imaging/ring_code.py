@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from robcal.columns import Columns
 from robcal.errors import InvalidInput
 from robcal.imaging.edge_model import tail
 
@@ -56,7 +57,7 @@ def is_id(number: int) -> bool:
 
 
 @dataclass(frozen=True)
-class RingReadings:
+class RingReadings(Columns):
     """Readings of n rings.
 
     Attributes

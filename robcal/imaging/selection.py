@@ -70,7 +70,7 @@ def accept(
         refused = good & bad
         log.add_rows(dots.xy[refused], dots.semi_axes[refused, 0], reason)
         good &= ~bad
-    return dots.take(good)
+    return dots.select(good)
 
 
 def without_ring_parts(
@@ -83,7 +83,7 @@ def without_ring_parts(
         # a segment lies between 2 and 3; an uncoded dot of the same size would reach out of that band
         keep &= ~((rho > 1.8) & (rho < 3.2))
     log.add_rows(candidates.xy[~keep], candidates.semi_axes[~keep, 0], Reason.RING_PART)
-    return candidates.take(keep)
+    return candidates.select(keep)
 
 
 def without_duplicates(dots: FittedDots, readings: RingReadings, log: RejectionLog) -> tuple[FittedDots, RingReadings]:
@@ -120,4 +120,4 @@ def without_duplicates(dots: FittedDots, readings: RingReadings, log: RejectionL
                 reason = Reason.RING_PART if ring else Reason.DUPLICATE
                 log.add(dots.xy[other, 0], dots.xy[other, 1], dots.semi_axes[other, 0], reason)
     kept = RingReadings(*(getattr(readings, f)[keep] for f in RingReadings.__dataclass_fields__))
-    return dots.take(keep), kept
+    return dots.select(keep), kept

@@ -40,7 +40,7 @@ class Windows:
     radius: Array
     saturated: NDArray[np.bool_]
 
-    def take(self, chosen: NDArray) -> "Windows":
+    def select(self, chosen: NDArray) -> "Windows":
         """The chosen rows."""
         if len(chosen) == len(self.index) and np.array_equal(chosen, np.arange(len(chosen))):
             return self

@@ -6,7 +6,7 @@ import numpy as np
 
 from robcal.cause import Kind
 from robcal.physics.cause import Basis, Entry, RobotCause
-from robcal.physics.site import LETTER_OF_KIND, Joint, RobotSite, each_joint
+from robcal.physics.site import Joint, RobotSite, each_joint
 
 APPROACH_SIZE = Kind(
     "approach_size",
@@ -27,8 +27,7 @@ def _approach_size(site: RobotSite, joint: Joint) -> Iterator[RobotCause]:
     usual = float(np.sqrt(np.mean(site.variables[name] ** 2)))
     yield RobotCause(
         APPROACH_SIZE,
-        joint.where,
-        LETTER_OF_KIND[joint.own_angle],
+        *joint.place,
         ("share",),
         (TYPICAL / usual,),
         lambda v, c: {"deg_per_deg": float(v[0])},

@@ -1,13 +1,13 @@
 """Causes that act in the direction of rotation of a joint: compliance, backlash, hysteresis, gears, references."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
 
 from robcal.cause import Kind
 from robcal.physics.cause import LEAST_MOMENT, PER_KNM, Array, Basis, Constants, Entry, RobotCause
-from robcal.physics.site import LETTER_OF_KIND, Joint, RobotSite, breaks, each_joint, evenly, exponential_law
+from robcal.physics.site import Joint, RobotSite, breaks, each_joint, evenly, exponential_law
 from robcal.robot.terms import identifier
 
 STIFFNESS_NONLINEAR = Kind(
@@ -92,8 +92,7 @@ def _compliance(site: RobotSite, joint: Joint) -> Iterator[RobotCause]:
     if elastic not in site.fitted:
         yield RobotCause(
             JOINT_COMPLIANCE,
-            joint.where,
-            LETTER_OF_KIND[joint.own_angle],
+            *joint.place,
             (elastic,),
             (site.compliance(torque, 3e-6),),
             lambda v, c: {"compliance_deg_per_kNm": float(v[0]) * PER_KNM},
@@ -117,13 +116,12 @@ def _stiffness(site: RobotSite, joint: Joint) -> Iterator[RobotCause]:
     linear = Basis(joint.frame, "q", torque, "linear")
 
     def report(v: Array, c: Constants) -> dict[str, object]:
-        told: dict[str, object] = {} if linear_fitted else {"linear_deg_per_kNm": (held + float(v[1])) * PER_KNM}
-        return told | {"cubic_deg_per_kNm3": float(v[0] * np.degrees(1.0) * 1e9)}
+        reported: dict[str, object] = {} if linear_fitted else {"linear_deg_per_kNm": (held + float(v[1])) * PER_KNM}
+        return reported | {"cubic_deg_per_kNm3": float(v[0] * np.degrees(1.0) * 1e9)}
 
     yield RobotCause(
         STIFFNESS_NONLINEAR,
-        joint.where,
-        LETTER_OF_KIND[joint.own_angle],
+        *joint.place,
         ("cubic",) if linear_fitted else ("cubic", "linear"),
         (2e-4 / largest**3,) if linear_fitted else (2e-4 / largest**3, 3e-6),
         report,
@@ -161,13 +159,12 @@ def _backlash(site: RobotSite, joint: Joint) -> Iterator[RobotCause]:
         return (Basis(joint.frame, "q", law, "width", c),)
 
     def report(v: Array, c: Constants) -> dict[str, object]:
-        told: dict[str, object] = {name: float(v[0]) * joint.factor}
-        return told | {"threshold_Nm": c["threshold_Nm"]} if c.get("threshold_Nm") else told
+        reported: dict[str, object] = {name: float(v[0]) * joint.factor}
+        return reported | {"threshold_Nm": c["threshold_Nm"]} if c.get("threshold_Nm") else reported
 
     yield RobotCause(
         BACKLASH,
-        joint.where,
-        LETTER_OF_KIND[joint.own_angle],
+        *joint.place,
         ("width",),
         (_lag(joint),),
         report,
@@ -206,8 +203,7 @@ def _hysteresis(site: RobotSite, joint: Joint) -> Iterator[RobotCause]:
     name = f"width_{joint.unit}"
     yield RobotCause(
         HYSTERESIS,
-        joint.where,
-        LETTER_OF_KIND[joint.own_angle],
+        *joint.place,
         ("width",),
         (_lag(joint),),
         lambda v, c: {name: float(v[0]) * joint.factor},
@@ -227,8 +223,7 @@ def _lost_motion(site: RobotSite, joint: Joint) -> Iterator[RobotCause]:
         return
     yield RobotCause(
         LOST_MOTION,
-        joint.where,
-        LETTER_OF_KIND[joint.own_angle],
+        *joint.place,
         ("amplitude",),
         (2e-4,),
         lambda v, c: {"amplitude_deg": float(v[0]) * np.degrees(1.0), "torque_Nm": c["torque_Nm"]},
@@ -246,8 +241,7 @@ def _zero_jump(site: RobotSite, joint: Joint) -> Iterator[RobotCause]:
     name = f"jump_{joint.unit}"
     yield RobotCause(
         ZERO_JUMP,
-        joint.where,
-        LETTER_OF_KIND[joint.own_angle],
+        *joint.place,
         ("jump",),
         (5e-4,),
         lambda v, c: {"pose": c["pose"], name: float(v[0]) * joint.factor},
@@ -268,28 +262,15 @@ def _harmonic(k: int, frame: str, kind: str, order: float) -> tuple[Basis, Basis
 
 
 def _eccentricity(site: RobotSite, joint: Joint) -> Iterator[RobotCause]:
-    if joint.prismatic:
-        return
-
-    def report(v: Array, c: Constants) -> dict[str, object]:
-        amplitude, phase = _amplitude_phase(v, np.degrees(1.0))
-        return {"order": int(c["order"]), "amplitude_deg": amplitude, "phase_deg": phase}
-
-    yield RobotCause(
-        JOINT_ECCENTRICITY,
-        joint.where,
-        LETTER_OF_KIND[joint.own_angle],
-        ("cosine", "sine"),
-        (3e-4, 3e-4),
-        report,
-        grid=({"order": 1.0}, {"order": 2.0}),
-        bases=lambda c: _harmonic(joint.number, joint.frame, "q", c["order"]),
-        covariates=(f"q{joint.number}",),
-        limits=(-LARGEST, LARGEST),
-    )
+    return _periodic(joint, JOINT_ECCENTRICITY, 3e-4, (1, 2))
 
 
 def _ripple(site: RobotSite, joint: Joint) -> Iterator[RobotCause]:
+    return _periodic(joint, GEAR_RIPPLE, 1e-4, range(3, HIGHEST_RIPPLE_ORDER + 1))
+
+
+def _periodic(joint: Joint, kind: Kind, size: float, orders: Iterable[int]) -> Iterator[RobotCause]:
+    """Waves over the joint angle, of prior size ``size`` (rad)."""
     if joint.prismatic:
         return
 
@@ -300,13 +281,12 @@ def _ripple(site: RobotSite, joint: Joint) -> Iterator[RobotCause]:
         return {"order": order, "amplitude_deg": amplitude, "phase_deg": phase}
 
     yield RobotCause(
-        GEAR_RIPPLE,
-        joint.where,
-        LETTER_OF_KIND[joint.own_angle],
+        kind,
+        *joint.place,
         ("cosine", "sine"),
-        (1e-4, 1e-4),
+        (size, size),
         report,
-        grid=tuple({"order": float(o)} for o in range(3, HIGHEST_RIPPLE_ORDER + 1)),
+        grid=tuple({"order": float(order)} for order in orders),
         bases=lambda c: _harmonic(joint.number, joint.frame, "q", c["order"]),
         covariates=(f"q{joint.number}",),
         limits=(-LARGEST, LARGEST),
@@ -317,8 +297,7 @@ def _ratio(site: RobotSite, joint: Joint) -> Iterator[RobotCause]:
     k = joint.number
     yield RobotCause(
         TRANSMISSION_RATIO,
-        joint.where,
-        LETTER_OF_KIND[joint.own_angle],
+        *joint.place,
         ("ratio",),
         (2e-4,),
         lambda v, c: {"ratio_error_ppm": float(v[0]) * 1e6},
@@ -339,14 +318,7 @@ def _coupling(site: RobotSite) -> Iterator[RobotCause]:
             return {"from": where, "ratio": float(v[0])}
 
         yield RobotCause(
-            JOINT_COUPLING,
-            joint.where,
-            LETTER_OF_KIND[joint.own_angle],
-            ("ratio",),
-            (3e-4,),
-            report,
-            bases=bases,
-            covariates=(f"q{driver.number}",),
+            JOINT_COUPLING, *joint.place, ("ratio",), (3e-4,), report, bases=bases, covariates=(f"q{driver.number}",)
         )
 
 
@@ -371,8 +343,7 @@ def _counterbalance(site: RobotSite) -> Iterator[RobotCause]:
         size = max(0.2 * largest, 1.0)
         yield RobotCause(
             COUNTERBALANCE,
-            joint.where,
-            LETTER_OF_KIND[joint.own_angle],
+            *joint.place,
             ("cosine", "sine"),
             (size, size),
             report,
@@ -396,8 +367,7 @@ def _zero_drift(site: RobotSite, joint: Joint) -> Iterator[RobotCause]:
 
         yield RobotCause(
             THERMAL_ZERO_DRIFT,
-            joint.where,
-            LETTER_OF_KIND[joint.own_angle],
+            *joint.place,
             ("drift",),
             (3e-5,),
             lambda v, c: {f"{joint.unit}_per_K": float(v[0]) * joint.factor},
@@ -411,8 +381,7 @@ def _zero_drift(site: RobotSite, joint: Joint) -> Iterator[RobotCause]:
         start = float(np.min(site.variables["time_s"]))
         yield RobotCause(
             THERMAL_ZERO_DRIFT,
-            joint.where,
-            LETTER_OF_KIND[joint.own_angle],
+            *joint.place,
             ("drift",),
             (3e-4 / duration,),
             lambda v, c: {f"{joint.unit}_per_h": float(v[0]) * joint.factor, "tau_h": c["tau_h"]},

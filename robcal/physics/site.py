@@ -28,6 +28,11 @@ class Joint:
         return f"axis{self.number}"
 
     @property
+    def place(self) -> tuple[str, str]:
+        """Its name, and the letter of the direction in which it moves."""
+        return self.where, LETTER_OF_KIND[self.own_angle]
+
+    @property
     def unit(self) -> str:
         """Unit of the joint coordinate in files."""
         return "mm" if self.prismatic else "deg"

@@ -1,24 +1,16 @@
-"""The two comparison centres: near the truth on even dots, the grey centroid biased under shading."""
+"""The comparison centre: near the truth on even dots, none where there is no contour."""
 
 import numpy as np
 
 from robcal.imaging.detect import detect_targets
-from robcal.imaging.other_centroids import contour_centres, grey_centroids
+from robcal.imaging.other_centroids import contour_centres
 from tests.imaging.rendering import Dot, expose, render, scene
 
 
-def test_both_are_near_on_an_even_dot() -> None:
+def test_contour_is_near_on_an_even_dot() -> None:
     image = expose(render(60, 60, [Dot(30.3, 29.6, 8, 6, 0.5)]), np.random.default_rng(1), read_noise=0.3, gain=0.0)
     args = (image, np.array([[30.0, 30.0]]), np.array([[8.0, 6.0]]), np.array([15.0]))
-    assert np.abs(grey_centroids(*args)[0] - (30.3, 29.6)).max() < 0.02
     assert np.abs(contour_centres(*args, np.array([180.0]))[0] - (30.3, 29.6)).max() < 0.06
-
-
-def test_grey_centroid_is_biased_by_shading() -> None:
-    light = render(60, 60, [Dot(30.0, 30.0, 8, 8)], gradient=(0.1 / 16 * 2, 0.0))
-    image = expose(light, np.random.default_rng(2), read_noise=0.3, gain=0.0, contrast=150)
-    centre = grey_centroids(image, np.array([[30.0, 30.0]]), np.array([[8.0, 8.0]]), np.array([15.0]))
-    assert centre[0, 0] - 30.0 > 0.12
 
 
 def test_no_contour_is_nan() -> None:

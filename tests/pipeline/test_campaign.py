@@ -49,7 +49,7 @@ def test_approach_is_inferred_and_said_to_be(point_campaign: Path) -> None:
     edit_rows(point_campaign / "poses.csv", drop)
     campaign = read_campaign(point_campaign)
     assert campaign.poses is not None
-    assert campaign.poses.approach_inferred
+    assert campaign.poses.inferred
     assert "inferred from the order" in campaign.notes[0]
     q = campaign.poses.q
     assert campaign.poses.approach[1, 0] == np.sign(q[1, 0] - q[0, 0])

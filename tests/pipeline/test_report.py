@@ -53,7 +53,7 @@ class Page(HTMLParser):
 
     @property
     def chapters(self) -> list[str]:
-        return [str(a.get("id")) for t, a in self.tags if t == "section" and a.get("class") == "chapter"]
+        return [str(a.get("id")) for t, a in self.tags if t == "section" and "chapter" in str(a.get("class")).split()]
 
     @property
     def figures(self) -> list[dict]:

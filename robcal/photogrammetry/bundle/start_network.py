@@ -23,9 +23,6 @@ from robcal.photogrammetry.orientation.robust_pose import ideal_points, robust_p
 from robcal.photogrammetry.orientation.start_planar import best_references, planar_starts, plane_share
 from robcal.transforms import Array, frame
 
-_TRUNCATED = 9.0
-"""Value of :func:`truncated_cost` for a mark that does not fit at all."""
-
 
 @dataclass(frozen=True)
 class Approximate:

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from robcal.columns import Columns
 from robcal.photogrammetry.core.camera import Camera, project_with_jacobians
 from robcal.photogrammetry.core.eccentricity import shape_normals
 from robcal.transforms import Array, transform
@@ -34,7 +35,7 @@ _FLAT = np.radians(5.0)
 
 
 @dataclass(frozen=True)
-class Discs:
+class Discs(Columns):
     """Discs of t targets; NaN where the ellipses do not determine it.
 
     Attributes
@@ -48,10 +49,6 @@ class Discs:
     normal: Array
     sigma: Array
     images: IntArray
-
-    def select(self, rows: IntArray) -> "Discs":
-        """The discs of some targets."""
-        return Discs(self.diameter[rows], self.normal[rows], self.sigma[rows], self.images[rows])
 
 
 def discs_from_ellipses(

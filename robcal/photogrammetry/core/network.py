@@ -5,12 +5,13 @@ Lengths in metres, angles in radians, image coordinates in pixels with the centr
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from robcal.columns import Columns
 from robcal.errors import InvalidInput
 from robcal.estimation.summary import SolveSummary
 from robcal.photogrammetry.core.camera import Camera
@@ -27,7 +28,7 @@ def frozen(values: ArrayLike, dtype: type = float) -> NDArray[Any]:
 
 
 @dataclass(frozen=True)
-class ImageMarks:
+class ImageMarks(Columns):
     """Measured image points, one row each.
 
     Attributes
@@ -73,22 +74,9 @@ class ImageMarks:
     def __len__(self) -> int:
         return len(self.image)
 
-    def select(self, rows: ArrayLike) -> "ImageMarks":
-        """The marks of the given rows (indices or mask)."""
-        chosen = np.asarray(rows)
-        return replace(
-            self,
-            image=self.image[chosen],
-            target=self.target[chosen],
-            xy=self.xy[chosen],
-            covariance=self.covariance[chosen],
-            semi_axes=None if self.semi_axes is None else self.semi_axes[chosen],
-            group=None if self.group is None else self.group[chosen],
-        )
-
 
 @dataclass(frozen=True)
-class Lengths:
+class Lengths(Columns):
     """Known distances between pairs of targets (scale bars, check lengths).
 
     Attributes
@@ -122,11 +110,6 @@ class Lengths:
     def none(cls) -> "Lengths":
         """No lengths at all."""
         return cls(np.zeros((0, 2), np.int64), np.zeros(0), np.zeros(0))
-
-    def select(self, rows: ArrayLike) -> "Lengths":
-        """The lengths of the given rows (indices or mask)."""
-        chosen = np.asarray(rows)
-        return Lengths(self.ids[chosen], self.length[chosen], self.sigma[chosen])
 
 
 @dataclass(frozen=True)

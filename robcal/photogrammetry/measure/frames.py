@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from robcal.columns import Columns
 from robcal.errors import DegenerateGeometry, InvalidInput
 from robcal.photogrammetry.core.bodies import Body, IntArray, spans_plane
 from robcal.photogrammetry.measure.distance_criterion import make_pairs
@@ -75,7 +76,7 @@ class MeasuredFrames:
 
 
 @dataclass(frozen=True)
-class _BodyPoints:
+class _BodyPoints(Columns):
     """Points of a body, m of them: row of the measured points and of the body, pose, coordinates and covariance."""
 
     at: IntArray
@@ -83,9 +84,6 @@ class _BodyPoints:
     pose: IntArray
     p_world: Array
     covariance: Array
-
-    def select(self, keep: NDArray[np.bool_]) -> "_BodyPoints":
-        return _BodyPoints(self.at[keep], self.row[keep], self.pose[keep], self.p_world[keep], self.covariance[keep])
 
 
 def measure_frames(

@@ -2,12 +2,12 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy import stats
 
+from robcal.columns import Columns
 from robcal.errors import DegenerateGeometry
 from robcal.photogrammetry.core.bodies import Body, IntArray, spans_plane
 from robcal.photogrammetry.core.camera import project
@@ -20,7 +20,7 @@ from robcal.transforms import Array, invert, skew, transform
 
 
 @dataclass(frozen=True)
-class _Points:
+class _Points(Columns):
     """Columns of :class:`MeasuredPoints`, m rows."""
 
     pose: IntArray
@@ -30,16 +30,6 @@ class _Points:
     n_cameras: IntArray
     residual: Array
     jacobian: Array
-
-    @property
-    def columns(self) -> tuple[Any, ...]:
-        return (self.pose, self.target, self.p_world, self.covariance, self.n_cameras, self.residual, self.jacobian)
-
-    def select(self, rows: ArrayLike) -> "_Points":
-        return _Points(*(column[np.asarray(rows)] for column in self.columns))
-
-    def joined(self, other: "_Points") -> "_Points":
-        return _Points(*(np.concatenate(pair) for pair in zip(self.columns, other.columns, strict=True)))
 
 
 def measure_points(

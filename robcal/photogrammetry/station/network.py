@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robcal.cause import Cause
+from robcal.columns import Columns
 from robcal.errors import InvalidInput
 from robcal.photogrammetry.core.bodies import Body, IntArray
 from robcal.photogrammetry.core.camera import Camera
@@ -149,7 +150,7 @@ class Unknowns:
 
 
 @dataclass(frozen=True)
-class MarkTable:
+class MarkTable(Columns):
     """All marks of the station in one table.
 
     ``camera``, ``exterior``, ``pose``, ``target`` (m,) are rows of the unknowns' arrays (``pose``: position among the
@@ -165,19 +166,6 @@ class MarkTable:
     covariance: Array
     radius: Array
     normals: Array
-
-    def select(self, rows: NDArray[np.bool_]) -> "MarkTable":
-        """The table reduced to some rows."""
-        return MarkTable(
-            self.camera[rows],
-            self.exterior[rows],
-            self.pose[rows],
-            self.target[rows],
-            self.xy[rows],
-            self.covariance[rows],
-            self.radius[rows],
-            self.normals[rows],
-        )
 
     def __len__(self) -> int:
         return len(self.camera)

@@ -89,46 +89,6 @@ def _statistics(
 
 
 @dataclass(frozen=True)
-class ColumnTest:
-    """Score test of extra columns: chi-square ``statistic`` with ``degrees``, ``estimate`` (k,) and its ``covariance``
-    (k, k) in the units of the columns. The statistic is the drop of the sum of squares on adding them."""
-
-    statistic: float
-    degrees: int
-    estimate: Array
-    covariance: Array
-
-
-def score_columns(design: StationDesign, marks: MarkTable, columns: IntArray, extra: Array) -> ColumnTest:
-    """Would these columns explain what is left, beyond all that is adjusted already?
-
-    Parameters
-    ----------
-    columns : (m, 18) global column numbers (:func:`robcal.photogrammetry.station.adjustment.global_columns`).
-    extra : (m, 2, k) derivative of the image coordinates (px) by the extra unknowns; whitened here.
-    """
-    X = design.whitening @ extra
-    B, p = design.by_pose, len(design.pose_inverse)
-    A = np.concatenate([design.by_exterior, design.by_interior, design.by_point], axis=-1)
-    k, g = X.shape[-1], len(design.reduced_inverse)
-    with_pose = sum_by(marks.pose, np.swapaxes(X, -1, -2) @ B, p) @ design.pose_inverse
-    G = np.zeros((k, g))
-    product = np.swapaxes(X, -1, -2) @ A
-    for j in range(18):
-        np.add.at(G.T, columns[:, j], product[:, :, j])
-    G -= np.einsum("pki,gpi->kg", with_pose, design.coupling)
-    M = np.einsum("mik,mil->kl", X, X) - G @ design.reduced_inverse @ G.T
-    M -= np.einsum("pki,pli->kl", with_pose, sum_by(marks.pose, np.swapaxes(X, -1, -2) @ B, p))
-    score = np.einsum("mik,mi->k", X, design.residual)
-    size = np.sqrt(np.maximum(np.einsum("mik,mik->k", X, X), 1e-300))
-    values, vectors = np.linalg.eigh(0.5 * (M + M.T) / np.outer(size, size))
-    good = values > 1e-9
-    inverse = (vectors * np.where(good, 1.0 / np.where(good, values, 1.0), 0.0)) @ vectors.T / np.outer(size, size)
-    estimate = inverse @ score
-    return ColumnTest(float(score @ estimate), int(good.sum()), estimate, inverse)
-
-
-@dataclass(frozen=True)
 class TargetScan:
     """Tests of given coordinates: ``statistic`` (t,) chi-square (3), ``error`` (t, 3) true minus given with
     ``covariance`` (t, 3, 3), and ``rest`` (t,) the median statistic of the other targets once this one is freed."""

@@ -9,10 +9,9 @@ from robcal.errors import DegenerateGeometry, InvalidInput
 from robcal.photogrammetry.core.bodies import Body
 from robcal.photogrammetry.core.camera import Camera, project
 from robcal.photogrammetry.measure.points import measure_points
-from robcal.photogrammetry.station.adjustment import global_columns, linearise
+from robcal.photogrammetry.station.adjustment import linearise
 from robcal.photogrammetry.station.network import StationMarks, StationSettings, Unknowns
 from robcal.photogrammetry.station.orientation import orient_station
-from robcal.photogrammetry.station.scan import score_columns
 from robcal.photogrammetry.station.start import find_swap, resect_station
 from robcal.transforms import exp_so3, frame, retract, transform
 from tests.photogrammetry.stations import SIZE, Station, nees, simulate
@@ -173,21 +172,6 @@ def test_noise_of_each_camera_is_estimated():
     o = _orient(s, s.cameras)
     assert abs(o.noise["left"] - 1.0) < 0.1
     assert abs(o.noise["right"] - 2.0) < 0.2
-
-
-def test_score_of_a_missing_lens_term_is_its_estimate():
-    s = simulate(points=12, flat=False, poses=30)
-    flat = {n: replace(c, p1=0.0, p2=0.0) for n, c in s.cameras.items()}
-    o = orient_station(s.marks, s.body, flat, s.sizes, settings=StationSettings(intrinsics="fixed"))
-    x = Unknowns(np.array([c.vector for c in o.cameras]), o.world_T_exterior, o.world_T_body, o.body.points)
-    lin = linearise(o.marks, x, o.cameras, np.array([o.noise[n] for n in o.names]))
-    per_pixel = np.linalg.inv(o.design.whitening) @ lin.by_interior
-    columns = global_columns(o.marks, len(o.world_T_exterior), len(o.names))
-    left = (o.marks.camera == 0)[:, None, None]
-    found = score_columns(o.design, o.marks, columns, np.where(left, per_pixel[:, :, 6:8], 0.0))
-    assert found.degrees == 2
-    assert found.statistic > 30
-    assert np.allclose(found.estimate, [2e-4, -1e-4], atol=8e-5)
 
 
 def test_exchanged_targets_that_mirror_a_small_plate_are_found() -> None:

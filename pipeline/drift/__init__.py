@@ -1,0 +1,1 @@
+"""State, files and page of a drift control; the method is in :mod:`robcal.drift`."""

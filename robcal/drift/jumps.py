@@ -1,0 +1,94 @@
+"""Tells a jump from drift: a body that was pushed, a joint that slipped in a crash.
+
+Temperatures change slowly, so between two tours each parameter may change by a share of its expected thermal change
+only. What the tour shows beyond that is compared with what a displaced body or a slipped joint would show, by the
+ratio of likelihoods (Kay 1998, Detection Theory, section 7.3), under the covariance of noise and possible drift.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import linalg, stats
+
+from robcal import transforms as tf
+from robcal.drift.fit import Linearised
+from robcal.drift.reference import DriftReference, Ints
+from robcal.transforms import Array
+
+
+@dataclass(frozen=True)
+class Jump:
+    """The likeliest jump.
+
+    Attributes
+    ----------
+    what : 'body' or the name of a joint's frame. size : m (how far its targets moved on average) or rad.
+    p_value : chance of such a sign without a jump.
+    """
+
+    what: str
+    size: float
+    p_value: float
+
+    @property
+    def text(self) -> str:
+        """A sentence for a person."""
+        if self.what == "body":
+            return (
+                f"all targets moved together by {1e3 * self.size:.2f} mm at once: was the body or its stand pushed? "
+                "The model stays as it was; measure a new reference (drift init) when all stands firmly"
+            )
+        return (
+            f"{self.what} turned by {np.degrees(self.size):.3f} deg at once: a crash, or a lost reference? The model "
+            "stays as it was; check the mastering, then 'drift rollback' takes the control up again"
+        )
+
+
+def allowed_share(elapsed: float, time_constant: float) -> float:
+    """Share of its expected thermal change by which a parameter may change within a time (s)."""
+    return min(1.0, max(elapsed, 0.0) / time_constant)
+
+
+def find_jump(reference: DriftReference, slots: Ints, linear: Linearised, elapsed: float, model: Array) -> Jump | None:
+    """The jump that a tour shows against the model in force, None where drift and noise explain it.
+
+    Parameters
+    ----------
+    slots : of the tour's readings, gross errors left out.
+    linear : their displacements about the model in force. elapsed : s since that model's tour.
+    model : (p, p) covariance of the model in force.
+
+    Weakness: right after a long standstill the whole thermal change is possible, and a jump that looks like one is
+    not told.
+    """
+    m, p = len(slots), len(reference.names)
+    share = allowed_share(elapsed, reference.settings.time_constant)
+    A = linear.A.reshape(3 * m, p)
+    S = linalg.block_diag(*linear.C) + A @ (np.diag((share * reference.sizes) ** 2) + model) @ A.T
+    factor = linalg.cho_factor(S, check_finite=False)
+    best, score = None, -np.inf
+    for what, H in _hypotheses(reference, slots).items():
+        weighted = linalg.cho_solve(factor, H, check_finite=False)
+        normal = weighted.T @ H
+        estimate = np.linalg.lstsq(normal, weighted.T @ linear.r.ravel(), rcond=1e-9)[0]
+        gain = float(estimate @ normal @ estimate)
+        way = float(np.mean(np.linalg.norm((H @ estimate).reshape(-1, 3), axis=1)))
+        size = way if what == "body" else float(abs(estimate[0]))
+        # a body's six numbers fit more than a joint's one by chance (Akaike 1974)
+        if gain - 2 * H.shape[1] > score:
+            best, score = Jump(what, size, float(stats.chi2.sf(gain, H.shape[1]))), gain - 2 * H.shape[1]
+    if best is None or best.p_value >= reference.settings.level:
+        return None
+    return best if best.size > reference.settings.least_jump[0 if best.what == "body" else 1] else None
+
+
+def _hypotheses(reference: DriftReference, slots: Ints) -> dict[str, Array]:
+    """Columns (3m, d) of displacements per unit: the body's six, and each joint's angle."""
+    moved = reference.joint_columns[slots]
+    p = reference.p[slots]
+    turned = -tf.skew(p - p.mean(axis=0))
+    body = np.concatenate([np.broadcast_to(np.eye(3), turned.shape), turned], axis=2).reshape(-1, 6)
+    joints = reference.kernel.model.joints
+    return {"body": body, **{f.name: moved[:, :, k].reshape(-1, 1) for k, f in enumerate(joints)}}
