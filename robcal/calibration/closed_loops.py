@@ -66,7 +66,7 @@ def loop_observations(kind: str, pose: ArrayLike, value: ArrayLike, sigma: Array
     values, sigmas = np.asarray(value, dtype=float), np.asarray(sigma, dtype=float)
     if kind == "point":
         zero = np.zeros((len(rows), 3))
-        return PointObservations(rows, zero, zero, sigmas[:, None, None] ** 2 * np.eye(3), np.zeros(len(rows)))
+        return PointObservations(rows, zero, zero, sigmas[:, None, None] ** 2 * np.eye(3), np.zeros_like(rows))
     if kind == "plane":
         return PlaneObservations(rows, values, sigmas)
     if kind == "length":
