@@ -10,6 +10,7 @@ if TYPE_CHECKING:  # a stage depends on the types that it uses, not on those of 
 
     from pipeline.stages.detect import DetectionIndex
     from robcal.calibration.calibrated import CalibratedRobot
+    from robcal.calibration.instruments import IdentifiedInstruments
     from robcal.calibration.measurements import RobotRecording, Rows
     from robcal.calibration.verification import Verification
     from robcal.diagnosis.images.diagnosis import ImageFinding
@@ -45,6 +46,8 @@ CORRECTED_IMAGES: Artifact[Sequence[ImageFinding]] = Artifact("corrected_images"
 POINTS: Artifact[MeasuredPoints] = Artifact("points", "measure")
 FRAMES: Artifact[MeasuredFrames] = Artifact("frames", "frames")
 IDENTIFICATION: Artifact[Identification] = Artifact("identify", "identify")
+INSTRUMENTS: Artifact[IdentifiedInstruments] = Artifact("instruments", "identify")
+"""Where a campaign has several instruments, or one of whose world or tool something is known."""
 CALIBRATED: Artifact[CalibratedRobot] = Artifact("calibrated", "diagnose")
 """The robot in force after the diagnosis."""
 EVIDENCE: Artifact[Evidence] = Artifact("evidence", "diagnose")

@@ -1,12 +1,14 @@
 """A campaign: what was recorded and what is what, read and checked before any stage runs. Never written to."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
-from pipeline.campaign_schema import FORMAT, CampaignEntry, StationCameraEntry, SurveyEntry
+from pipeline.campaign_schema import FORMAT, CampaignEntry, InstrumentEntry, StationCameraEntry, SurveyEntry
+from pipeline.instrument_frames import cell_frames
+from robcal.calibration.instruments import CellFrame
 from robcal.errors import InvalidInput
 from robcal.files.body_file import BodyFile, check_ring_codes, read_body
 from robcal.files.camera_file import CameraFile, read_camera
@@ -61,11 +63,22 @@ class BodySource:
 
 
 @dataclass(frozen=True)
+class InstrumentSource:
+    """An instrument of the campaign: its tables, None for the own station, and what is known of its world and tool."""
+
+    tables: tuple[MeasuredTable, ...] | None
+    entry: InstrumentEntry | None
+    world: CellFrame
+    tool: CellFrame
+
+
+@dataclass(frozen=True)
 class Campaign:
     """Everything a run needs to know, in SI units.
 
     Attributes
     ----------
+    instruments : by name; empty where one instrument measured of which nothing is known beforehand.
     notes : what was assumed; warnings : what does not fit together but does not stop the work.
     """
 
@@ -77,6 +90,7 @@ class Campaign:
     bodies: Mapping[str, BodySource]
     cameras: Mapping[str, ImageSource]
     measurements: tuple[MeasuredTable, ...]
+    instruments: Mapping[str, InstrumentSource] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     files: tuple[Path, ...] = field(default=(), repr=False)
@@ -161,15 +175,11 @@ class _Reader:
         cameras = self._station(poses)
         if poses is None and entry.station is not None:
             poses = self._poses_from_images(cameras)
-        measurements = tuple(
-            read_measurements(self._file(name), poses.names if poses else ()) for name in entry.measurements
-        )
-        if robot is not None and poses is not None:
-            places = forward(chain_of(robot), poses.q)[:, :3, 3]
-            measurements = tuple(without_frozen(table, places, poses.names) for table in measurements)
+        measurements = self._tables(entry.measurements, robot, poses)
         for table in measurements:
             self.warnings.extend(table.notes)
             self._check_targets(table, bodies)
+        instruments = self._instruments(measurements, robot, poses, bodies)
         return Campaign(
             path=self.path,
             entry=entry,
@@ -179,10 +189,69 @@ class _Reader:
             bodies=bodies,
             cameras=cameras,
             measurements=measurements,
+            instruments=instruments,
             notes=tuple(self.notes),
             warnings=tuple(self.warnings),
             files=tuple(dict.fromkeys(self.files)),
         )
+
+    def _tables(self, names: Sequence[str], robot: RobotModel | None, poses: Poses | None) -> tuple[MeasuredTable, ...]:
+        tables = tuple(read_measurements(self._file(name), poses.names if poses else ()) for name in names)
+        if robot is None or poses is None:
+            return tables
+        places = forward(chain_of(robot), poses.q)[:, :3, 3]
+        return tuple(without_frozen(table, places, poses.names) for table in tables)
+
+    def _instruments(
+        self,
+        measurements: tuple[MeasuredTable, ...],
+        robot: RobotModel | None,
+        poses: Poses | None,
+        bodies: Mapping[str, BodySource],
+    ) -> dict[str, InstrumentSource]:
+        """All instruments; none where there is but one of whose world and tool nothing is stated."""
+        entry = self.entry
+        stated = {"world_T_base": entry.world_T_base, "flange_T_tool": entry.flange_T_tool}
+        for key in (k for k, v in stated.items() if v is not None and entry.instruments):
+            raise self._error((key,), f"'{key}' serves a campaign with one instrument: state it at the instrument")
+        if not entry.instruments and not any(stated.values()):
+            return {}
+        tables: dict[str, tuple[MeasuredTable, ...] | None] = {}
+        if entry.station is not None:
+            tables["station"] = None
+        if measurements:
+            tables["measurements"] = measurements
+        for name, use in entry.instruments.items():
+            if name in tables:
+                raise self._error(("instruments", name), f"'{name}' names two instruments: choose another name")
+            try:
+                tables[name] = self._tables(use.measurements, robot, poses)
+            except InvalidInput as error:
+                raise type(error)(f"instrument '{name}': {error}") from None
+            for table in tables[name] or ():
+                self.warnings.extend(table.notes)
+                self._check_instrument(name, use, table, bodies)
+        known = {n: (e.world_T_base, e.flange_T_tool) for n, e in entry.instruments.items()}
+        try:
+            worlds, tools = cell_frames(list(tables), known, (entry.world_T_base, entry.flange_T_tool), entry)
+        except InvalidInput as error:
+            raise self._error(("instruments",), str(error)) from None
+        return {
+            name: InstrumentSource(found, entry.instruments.get(name), worlds[name], tools[name])
+            for name, found in tables.items()
+        }
+
+    def _check_instrument(
+        self, name: str, use: InstrumentEntry, table: MeasuredTable, bodies: Mapping[str, BodySource]
+    ) -> None:
+        place = ("instruments", name, "body")
+        if use.body is not None and use.body not in bodies:
+            raise self._error(place, f"there is no body '{use.body}' under 'bodies'{proposal(use.body, list(bodies))}")
+        if (use.mounted == "hand") != (table.kind == "sensor_points"):
+            where = "measures in the hand" if table.kind == "sensor_points" else f"has {table.kind}"
+            wanted = "mounted: hand" if table.kind == "sensor_points" else "mounted: world"
+            raise self._error(("instruments", name), f"instrument '{name}' {where}: state '{wanted}'")
+        self._check_targets(table, bodies)
 
     def _error(self, place: tuple[str | int, ...], message: str) -> InvalidInput:
         line = self.document.line(place)
@@ -201,8 +270,8 @@ class _Reader:
     def _check_whole(self) -> None:
         entry = self.entry
         surveyed = any(body.survey for body in entry.bodies.values())
-        measured = bool(entry.measurements)
-        if entry.station is not None and measured:
+        measured = bool(entry.measurements) or bool(entry.instruments)
+        if entry.station is not None and entry.measurements and not entry.instruments:
             raise self._error(("measurements",), "'measurements' stand instead of 'station': keep one of them")
         if measured and entry.poses is None:
             raise self._error(("measurements",), "measurements need the table of their poses: add 'poses: poses.csv'")

@@ -1,11 +1,12 @@
 """campaign.yaml (format robcal/campaign-1): the entries as a person writes them."""
 
+import re
 from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field
 
 from robcal.files.robot_file import PayloadEntry
-from robcal.files.schemas import Entry, NotNegative, Positive, Text, Whole
+from robcal.files.schemas import Entry, NotNegative, Positive, Text, Triple, Whole
 
 FORMAT = "robcal/campaign-1"
 
@@ -15,6 +16,13 @@ def _folder_name(value: Any) -> Any:
     usable = text.strip() and text.isprintable() and not any(c in text for c in "/\\")
     if not usable or text in {".", ".."} or len(text) > 120:
         raise ValueError(f"must be a plain name without slashes (it names the run folder), found {text[:60]!r}")
+    return text
+
+
+def _instrument_name(value: Any) -> Any:
+    text = str(value)
+    if not re.fullmatch(r"[A-Za-z][\w-]{0,59}", text):
+        raise ValueError(f"an instrument's name has letters, digits, _ and -, found {text[:60]!r}")
     return text
 
 
@@ -126,6 +134,29 @@ class RobotUse(Entry):
     tip_link: Text | None = None
 
 
+Coordinate = Literal["x", "y", "z", "roll", "pitch", "yaw"]
+
+
+class CellFrameEntry(Entry):
+    """World or tool of an instrument: what is known of it; what is not stated is free."""
+
+    xyz_mm: Triple | None = None
+    rpy_deg: Triple | None = None
+    free: Literal["all", "none"] | list[Coordinate] | None = None
+    sigma_mm: Positive | None = None
+    sigma_deg: Positive | None = None
+
+
+class InstrumentEntry(Entry):
+    """A measuring system with a world and a tool of its own."""
+
+    measurements: Annotated[list[Text], BeforeValidator(_one_or_many)]
+    world_T_base: CellFrameEntry | None = None
+    flange_T_tool: CellFrameEntry | None = None
+    mounted: Literal["world", "hand"] = "world"
+    body: Text | None = None
+
+
 class CampaignEntry(Entry):
     """The whole file."""
 
@@ -139,6 +170,11 @@ class CampaignEntry(Entry):
     quality: QualityEntry = QualityEntry()
     measurements: Annotated[list[Text], BeforeValidator(_one_or_many)] = Field(default_factory=list)
     body: Text | None = None
+    instruments: dict[Annotated[str, BeforeValidator(_instrument_name)], InstrumentEntry] = Field(default_factory=dict)
+    same_world: list[list[Text]] = Field(default_factory=list)
+    same_tool: list[list[Text]] = Field(default_factory=list)
+    world_T_base: CellFrameEntry | None = None
+    flange_T_tool: CellFrameEntry | None = None
     model: ModelEntry = ModelEntry()
     bundle: BundleEntry = BundleEntry()
     diagnosis: DiagnosisEntry = DiagnosisEntry()

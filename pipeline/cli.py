@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from pipeline.cell_commands import cell
-from pipeline.command_line import CampaignPath, Json, Quiet, RunFolder, Workers, answers, wrong_use
+from pipeline.command_line import CampaignPath, InstrumentName, Json, Quiet, RunFolder, Workers, answers, wrong_use
 from pipeline.drift_commands import app as drift_app
 from pipeline.mastering_commands import mastering
 from pipeline.messages import LOG
@@ -120,6 +120,7 @@ def predict(
     nominal: Annotated[
         bool, typer.Option("--nominal", help="The uncalibrated robot after the best cell calibration.")
     ] = False,
+    instrument: InstrumentName = None,
     at_cycle: AtCycle = None,
     quiet: Quiet = False,
     as_json: Json = False,
@@ -128,7 +129,7 @@ def predict(
     with answers("predict", as_json, quiet) as answer:
         from pipeline.prediction import predict_run
 
-        answer.update(predict_run(run_folder, poses, out, nominal=nominal, at_cycle=at_cycle))
+        answer.update(predict_run(run_folder, poses, out, nominal=nominal, instrument=instrument, at_cycle=at_cycle))
         for sentence in answer["warnings"]:
             LOG.warning(sentence)
         LOG.info(f"{answer['poses']} frames in {out}")
@@ -150,6 +151,7 @@ def compensate(
     skip: Annotated[
         bool, typer.Option("--skip-unreachable", help="Leave out frames that the robot cannot reach.")
     ] = False,
+    instrument: InstrumentName = None,
     at_cycle: AtCycle = None,
     quiet: Quiet = False,
     as_json: Json = False,
@@ -174,6 +176,7 @@ def compensate(
                 in_base=in_base,
                 skip_unreachable=skip,
                 program=program,
+                instrument=instrument,
                 at_cycle=at_cycle,
             )
         )

@@ -18,6 +18,9 @@ Quiet = Annotated[bool, typer.Option("-q", "--quiet", help="Only warnings and er
 Json = Annotated[bool, typer.Option("--json", help="One result line for programs on standard output.")]
 Workers = Annotated[int | None, typer.Option("--workers", min=1, max=1024, help="Processes for work on images.")]
 RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder of a finished campaign.")]
+InstrumentName = Annotated[
+    str | None, typer.Option("--instrument", metavar="NAME", help="In the world and with the tool of this instrument.")
+]
 CampaignPath = Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="Campaign folder, or its YAML file.")]
 
 

@@ -19,15 +19,21 @@ from robcal.transforms import Array, frame_from_xyzrpy, invert
 
 
 def predict_run(
-    folder: Path, poses: Path, out: Path, *, nominal: bool = False, at_cycle: int | None = None
+    folder: Path,
+    poses: Path,
+    out: Path,
+    *,
+    nominal: bool = False,
+    instrument: str | None = None,
+    at_cycle: int | None = None,
 ) -> dict[str, Any]:
-    """Write where the tool is at the given poses, in the measuring system's coordinates.
+    """Write where the tool is at the given poses, in the coordinates of the measuring system (of an ``instrument``).
 
     Raises
     ------
     InvalidInput : no calibrated robot in the run, or a table that contradicts the contract.
     """
-    calibrated = robot_in_force(folder, at_cycle)
+    calibrated = robot_in_force(folder, at_cycle, instrument)
     wanted = read_poses(poses, calibrated.model, calibrated.model.payloads, to_predict=True)
     robot = calibrated.bare() if nominal else calibrated
     T, covariance = robot.predict(robot.inputs(wanted))
@@ -78,6 +84,7 @@ def compensate_run(
     in_base: bool = False,
     skip_unreachable: bool = False,
     program: str | None = None,
+    instrument: str | None = None,
     at_cycle: int | None = None,
 ) -> dict[str, Any]:
     """Write the commands that bring the real tool to the wanted frames: a table, or a ``program`` of a controller.
@@ -86,7 +93,7 @@ def compensate_run(
     ------
     InvalidInput : no calibrated robot in the run, a bad table, or a frame that the robot cannot reach.
     """
-    calibrated = robot_in_force(folder, at_cycle)
+    calibrated = robot_in_force(folder, at_cycle, instrument)
     model = calibrated.model
     wanted = read_wanted(frames, model.payloads)
     covariates = {name: np.full(len(wanted.T), value) for name, value in calibrated.defaults.items()}

@@ -158,6 +158,26 @@ def difference(a_T_b: ArrayLike, a_T_c: ArrayLike) -> Array:
     return np.concatenate([b_T_c[..., :3, 3], log_so3(b_T_c[..., :3, :3])], axis=-1)
 
 
+def twist_from_six(six: Array) -> Array:
+    """(n, 6, 6) Jacobian of the right perturbation (rho, omega) of a frame by its numbers x, y, z, roll, pitch, yaw.
+
+    With R = Rz(yaw) Ry(pitch) Rx(roll): rho = R' dt, and the body's turn is the sum of the rates about the line that
+    each angle turns about: omega = droll ex + Rx' dpitch ey + Rx' Ry' dyaw ez.
+    """
+    zero = np.zeros_like(six)
+    roll, pitch = zero.copy(), zero.copy()
+    roll[:, 3], pitch[:, 4] = six[:, 3], six[:, 4]
+    Rx = frame_from_xyzrpy(roll)[:, :3, :3]
+    Ry = frame_from_xyzrpy(pitch)[:, :3, :3]
+    R = frame_from_xyzrpy(six)[:, :3, :3]
+    jacobian = np.zeros((len(six), 6, 6))
+    jacobian[:, :3, :3] = np.swapaxes(R, 1, 2)
+    jacobian[:, 3, 3] = 1.0
+    jacobian[:, 3:, 4] = np.swapaxes(Rx, 1, 2)[:, :, 1]
+    jacobian[:, 3:, 5] = (np.swapaxes(Rx, 1, 2) @ np.swapaxes(Ry, 1, 2))[:, :, 2]
+    return jacobian
+
+
 def adjoint(a_T_b: ArrayLike) -> Array:
     """Matrices ``(..., 6, 6)`` that move a small perturbation on the right of b to one on the right of a.
 

@@ -33,6 +33,8 @@ def work(context: Context) -> Outcome:
         told = [str(finding.statement) for finding in images.findings] or [str(content["statement"])]
         result = {"mismatch": content["mismatch"], "p_value": content["p_value"], "causes": _named(images.findings)}
         return Outcome({"diagnosis": result | {"heldout_px": content["heldout_px"]}}, [run.diagnosis], told)
+    if campaign.instruments:
+        return Outcome(notes=["several instruments: the robot is not diagnosed"])
     station = run.find(artifacts.ORIENTATION)  # None where another system measured
     measured = Measured(body_for_robot(campaign, run), run.find(artifacts.POINTS), station)
     identification = run.load(artifacts.IDENTIFICATION)

@@ -4,12 +4,13 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.artifacts import CALIBRATED, IDENTIFICATION
+from pipeline.artifacts import CALIBRATED, IDENTIFICATION, INSTRUMENTS
 from pipeline.bodies import body_for_robot
 from pipeline.campaign import Campaign
+from pipeline.instrument_results import instrument_notes, instruments_result
 from pipeline.runs import Run
 from pipeline.stages.base import Context, Outcome, Stage
-from pipeline.stages.observations import build_recording
+from pipeline.stages.observations import build_instruments, build_recording
 from pipeline.stages.survey import located
 from robcal.calibration.calibrated import CalibratedRobot
 from robcal.calibration.identification import IdentifiedRobot, IdentifyOptions
@@ -19,13 +20,19 @@ from robcal.calibration.recording_errors.search import fault_of
 from robcal.errors import InvalidInput, RobcalError
 from robcal.files.poses_table import Poses
 from robcal.files.robot_file import write_robot
+from robcal.files.schemas import proposal
 from robcal.photogrammetry.survey.given_coordinates import GivenCoordinates
 from robcal.recipe.identification import identify_robot
+from robcal.recipe.instruments import identify_from_instruments, leading_identification
 from robcal.robot.kernel import Kernel
 from robcal.robot.model import RobotModel
 
 NAME = "identify"
-
+SETTINGS = {
+    *("robot", "model", "payloads", "measurements", "body"),
+    *("instruments", "same_world", "same_tool", "world_T_base", "flange_T_tool"),
+}
+"""Entries of campaign.yaml that this stage depends on."""
 
 SUFFIXES = {".csv", ".yaml", ".yml", ".urdf", ".xml"}
 """Files of a campaign that this stage may depend on; all others are images."""
@@ -48,6 +55,8 @@ def work(context: Context) -> Outcome:
     """Identify the robot from the poses that are not kept out."""
     campaign, run = context.campaign, context.run
     robot, poses = require_robot(campaign)
+    if campaign.instruments:
+        return _with_instruments(context)
     recording = build_recording(campaign, run, body_for_robot(campaign, run))
     _check_mirror_image(campaign, run, recording)
     try:
@@ -58,6 +67,28 @@ def work(context: Context) -> Outcome:
     write_robot(run.robot, found.robot.model, f"calibrated from campaign {campaign.name}, before the diagnosis")
     notes = [*found.recording.notes, *_notes(found.robot, poses, found.rows)]
     return Outcome({"identification": _result(found.robot, found.rows)}, outputs, notes)
+
+
+def _with_instruments(context: Context) -> Outcome:
+    """Identify the robot from all instruments together."""
+    campaign, run = context.campaign, context.run
+    robot, poses = require_robot(campaign)
+    options = options_of(campaign, stated=True)
+    try:
+        found = identify_from_instruments(robot, poses, build_instruments(campaign, run), options)
+    except InvalidInput as error:
+        raise located(error, str(campaign.path)) from None
+    leading = leading_identification(found)
+    outputs = [run.save(IDENTIFICATION, leading), run.save(INSTRUMENTS, found)]
+    seen = found.seen_by(found.telling, leading.robot)
+    write_robot(run.robot, seen.model, f"calibrated from campaign {campaign.name}, before the diagnosis")
+    notes = [*found.notes, *instrument_notes(found, poses)]
+    together = _result(leading.robot, leading.rows) | {
+        "poses": len(set().union(*(p.rows.tolist() for p in found.placed.values()))),
+        "parameters": len(found.names),
+        "outliers": sum(int(np.count_nonzero(~p.used)) for p in found.placed.values()),
+    }
+    return Outcome({"identification": together, "instruments": instruments_result(found)}, outputs, notes)
 
 
 def _check_mirror_image(campaign: Campaign, run: Run, recording: RobotRecording) -> None:
@@ -99,7 +130,7 @@ def check_joint_limits(campaign: Campaign, run: Run) -> None:
     if poses is None or robot is None or not poses.outside:
         return
     fault = ""
-    if campaign.measurements:
+    if campaign.measurements and not campaign.instruments:
         kernel = Kernel(robot, campaign.entry.model.statics)
         try:
             recording = build_recording(campaign, run, body_for_robot(campaign, run))
@@ -151,19 +182,32 @@ def _notes(found: IdentifiedRobot, poses: Poses, rows: Rows) -> list[str]:
     return notes
 
 
-def load_calibrated(run: Run) -> CalibratedRobot:
+def load_calibrated(run: Run, instrument: str | None = None) -> CalibratedRobot:
     """The robot with all that was found out about it: after the diagnosis where there was one.
+
+    In the world and with the tool of an ``instrument``; of several, by default of the one that tells most.
 
     Raises
     ------
-    InvalidInput : the run has no calibrated robot.
+    InvalidInput : the run has no calibrated robot, or no such instrument.
     """
-    found = run.find(CALIBRATED)
-    if found is not None:
-        return found
+    robot: CalibratedRobot | None = run.find(CALIBRATED)
     identified = run.find(IDENTIFICATION)
-    if identified is not None:
-        return identified.robot
+    if robot is None and identified is not None:
+        robot = identified.robot
+    instruments = run.find(INSTRUMENTS)
+    if instruments is None and instrument is not None:
+        raise InvalidInput(f"{run.folder}: the campaign has one instrument: leave --instrument out")
+    if robot is not None and instruments is not None:
+        name = instrument or instruments.telling
+        if name not in instruments.placed:
+            raise InvalidInput(
+                f"{run.folder}: there is no instrument '{name}'{proposal(name, list(instruments.placed))}"
+            )
+        placed = instruments.placed[name].robot
+        return placed if placed is not None and run.find(CALIBRATED) is None else instruments.seen_by(name, robot)
+    if robot is not None:
+        return robot
     raise InvalidInput(f"{run.folder}: holds no calibrated robot: the campaign needs a robot, poses and measurements")
 
 
@@ -174,7 +218,7 @@ STAGE = Stage(
     inputs=lambda campaign: [
         p for p in campaign.files if p.suffix.lower() in {".csv", ".yaml", ".yml", ".urdf", ".xml"}
     ],
-    settings=lambda campaign: campaign.entry.model_dump(include={"robot", "model", "payloads", "measurements", "body"}),
+    settings=lambda campaign: campaign.entry.model_dump(include=SETTINGS),
     after=("survey", "measure", "frames"),
     module=__name__,
 )

@@ -1,13 +1,40 @@
 """What the robot stages work on: the measurements as observation operators, for identification and for diagnosis."""
 
+from dataclasses import replace
+
 from pipeline.artifacts import FRAMES, POINTS
+from pipeline.bodies import body_for_robot, surveyed_or_given
 from pipeline.campaign import Campaign
 from pipeline.runs import Run
+from robcal.calibration.instruments import Instrument
 from robcal.calibration.measurements import RobotObservations, RobotRecording, frame_observations, used_points
 from robcal.calibration.observations import FrameObservations
 from robcal.errors import InvalidInput
 from robcal.files.recordings import observations_of
 from robcal.photogrammetry.core.bodies import Body
+
+
+def build_instruments(campaign: Campaign, run: Run) -> list[Instrument]:
+    """The instruments of a campaign with their measurements.
+
+    Raises
+    ------
+    InvalidInput : measurements that lack the coordinates they refer to.
+    """
+    out = []
+    for name, source in campaign.instruments.items():
+        if name == "station" or (name == "measurements" and campaign.entry.station is None):
+            tables = () if name == "station" else campaign.measurements
+            recording = build_recording(replace(campaign, measurements=tables), run, body_for_robot(campaign, run))
+        else:
+            seen = source.entry.body if source.entry is not None and source.entry.body else campaign.carried_body
+            body = surveyed_or_given(campaign, run, seen) if seen is not None else None
+            tables = source.tables or ()
+            observations = tuple(observations_of(table, body) for table in tables)
+            stated = all(table.covariance is not None for table in tables)
+            recording = RobotRecording(observations, observations, stated)
+        out.append(Instrument(name, recording, source.world, source.tool))
+    return out
 
 
 def build_recording(campaign: Campaign, run: Run, body: Body | None) -> RobotRecording:

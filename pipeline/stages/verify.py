@@ -7,12 +7,14 @@ import numpy as np
 
 from pipeline import artifacts
 from pipeline.codec import save_arrays
+from pipeline.instrument_results import instruments_result
 from pipeline.json_io import read_json
 from pipeline.runs import Run
 from pipeline.stages.base import Context, Outcome, Stage, no_files
 from pipeline.stages.identify import load_calibrated, options_of, require_robot
 from pipeline.stages.survey import located
 from robcal.calibration.calibrated import CalibratedRobot
+from robcal.calibration.instruments import IdentifiedInstruments
 from robcal.calibration.measurements import RobotObservations
 from robcal.calibration.noise_parts import NoiseParts
 from robcal.calibration.observations import (
@@ -22,11 +24,12 @@ from robcal.calibration.observations import (
     SensorPointObservations,
 )
 from robcal.calibration.verdict import verdict
-from robcal.calibration.verification import ErrorStatistics
+from robcal.calibration.verification import ErrorStatistics, Verification
 from robcal.errors import InvalidInput
 from robcal.files.poses_table import Poses
 from robcal.files.robot_file import write_robot
 from robcal.files.tables import write_table
+from robcal.recipe.instruments import telling_verification, verify_instruments
 from robcal.recipe.noise import noise_of
 from robcal.recipe.verdict import robot_facts
 from robcal.recipe.verification import RobotVerification, datum_note, verify_robot
@@ -48,27 +51,37 @@ def work(context: Context) -> Outcome:
     freed = run.find(artifacts.CORRECTED) if diagnosed else None
     relative = run.find(artifacts.RELATIVE_COVARIANCE) if diagnosed else None
     options = options_of(campaign, identification.recording.stated)
+    instruments = run.find(artifacts.INSTRUMENTS)
+    verified: dict[str, Verification] = {}
     try:
-        found = verify_robot(robot, identification, calibrated, poses, options, freed, relative)
+        if instruments is not None:
+            verified = verify_instruments(robot, instruments, poses, options)
+            found = telling_verification(instruments, verified)
+        else:
+            found = verify_robot(robot, identification, calibrated, poses, options, freed, relative)
     except InvalidInput as error:
         raise located(error, str(poses.path)) from None
     write_robot(run.robot, calibrated.model, f"calibrated from campaign {campaign.name}")
     _write_covariance(run, calibrated)
-    _write_residuals(run, poses, calibrated, identification.recording.observations)
+    _write_residuals(run, poses, calibrated, identification.recording.observations, instruments)
     outputs = [
         run.save(artifacts.VERIFICATION, (found.delivered, found.rows)),
         run.robot,
         run.covariance,
         run.residuals,
     ]
-    notes = [*found.notes, *_approach_note(found), *filter(None, [datum_note(identification, calibrated, poses)])]
+    datum = "" if instruments is not None else datum_note(identification, calibrated, poses)
+    notes = [*found.notes, *_approach_note(found), *filter(None, [datum])]
     diagnosis = read_json(run.diagnosis) if diagnosed and run.diagnosis.is_file() else None
     judged = verdict(
         robot_facts(identification, calibrated, poses, found.delivered, diagnosis, doubtful_coordinates(run))
     )
     told = {"grade": judged.grade, "text": judged.text, "reasons": list(judged.reasons)}
     noise = noise_of(identification, calibrated, poses)
-    result = {"verification": _result(found), "noise": _noise_result(noise), "verdict": told}
+    result = {"verification": verification_result(found), "noise": _noise_result(noise), "verdict": told}
+    if instruments is not None:
+        sections = {name: verification_result(RobotVerification(v, None, v.rows)) for name, v in verified.items()}
+        result["instruments"] = instruments_result(instruments, sections)
     return Outcome(result, outputs, [*notes, *noise.notes])
 
 
@@ -121,8 +134,29 @@ _KINDS: Mapping[type, str] = {
 }
 
 
-def _write_residuals(run: Run, poses: Poses, robot: CalibratedRobot, observations: Sequence[RobotObservations]) -> None:
+def _write_residuals(
+    run: Run,
+    poses: Poses,
+    robot: CalibratedRobot,
+    observations: Sequence[RobotObservations],
+    instruments: IdentifiedInstruments | None = None,
+) -> None:
     """residuals.csv: measured minus modelled; frames as a turn vector and in tool coordinates, points in the world."""
+    if instruments is None:
+        write_table(run.residuals, _residual_columns(poses, robot, observations))
+        return
+    columns: dict[str, list[object]] = {}
+    for name, placed in instruments.placed.items():
+        some = _residual_columns(poses, instruments.seen_by(name, robot), placed.recording.observations)
+        some["instrument"] = [name] * len(some["pose"])
+        for key, values in some.items():
+            columns.setdefault(key, []).extend(values)
+    write_table(run.residuals, columns)
+
+
+def _residual_columns(
+    poses: Poses, robot: CalibratedRobot, observations: Sequence[RobotObservations]
+) -> dict[str, list[object]]:
     T = robot.predict(poses.inputs(robot.kernel))[0]
     names = ("dx_mm", "dy_mm", "dz_mm", "rx_deg", "ry_deg", "rz_deg")
     columns: dict[str, list[object]] = {n: [] for n in ("pose", "set", "kind", "target", *names, "normalised")}
@@ -138,14 +172,15 @@ def _write_residuals(run: Run, poses: Poses, robot: CalibratedRobot, observation
             for k, name in enumerate(names):
                 columns[name].append(f"{scaled[i, k]:.6f}" if k < scaled.shape[1] else "")
             columns["normalised"].append(f"{np.sqrt(np.mean(white[i] ** 2)):.4f}")
-    write_table(run.residuals, columns)
+    return columns
 
 
 def _statistics(tools: Mapping[str, ErrorStatistics]) -> dict[str, dict[str, float]]:
     return {name: {key: value * 1000 for key, value in vars(errors).items()} for name, errors in tools.items()}
 
 
-def _result(found: RobotVerification) -> dict[str, Any]:
+def verification_result(found: RobotVerification) -> dict[str, Any]:
+    """Section `verification` of result.json, mm and deg."""
     outcome = found.delivered
     delivered = _statistics(outcome.tools)["0"]
     result: dict[str, Any] = {

@@ -117,7 +117,7 @@ def limit_rules(model: RobotModel, names: Sequence[str]) -> tuple[Array, NDArray
     priors = {f"{t.name}.{short}": 2.0 * sigma for t in model.terms for short, sigma in t.priors.items()}
     for k, name in enumerate(names):
         frame, _, kind = name.rpartition(".")
-        limits[k] = priors.get(name, PLAUSIBLE_START if frame in ("base", "tool") else np.inf)
+        limits[k] = priors.get(name, PLAUSIBLE_START if frame.rpartition(".")[2] in ("base", "tool") else np.inf)
         if frame not in frames:
             continue
         if kind in ("x", "y", "z"):

@@ -154,17 +154,28 @@ def identify(
             raise InvalidInput(f"robot '{model.name}' has no parameter '{name}'")
 
     engine = Engine(evaluator, choice, options.joint_sigma, options.priors, options.termination)
-    weights = np.ones(len(poses))
+    final, weights, outliers, statistics = estimate(engine, state, options.robust)
+    result = _result(engine, options, final, weights, outliers, statistics)
+    return replace(result, seconds=time.perf_counter() - clock, seconds_kernel=seconds_kernel)
+
+
+def estimate(
+    engine: Engine, state: State, robust: bool, groups: Sequence[NDArray[np.intp]] | None = None
+) -> tuple[Solution, Array, list[int], PoseStatistics]:
+    """Iterate from a state, leave out outlier poses, choose elasticities: solution, weights (n,), outliers, statistics.
+
+    ``groups`` : rows of poses that are compared with one another in the search for outliers.
+    """
+    weights = np.ones(engine.stack.n)
     first = engine.solve(state, weights)
     outliers: list[int] = []
     statistics: PoseStatistics | None = None
-    if options.robust:
-        outliers, weights, first, statistics = find_outliers(engine, first)
-    final = engine.choose(first, weights) if choice.own_axis or choice.cross_axis else first
+    if robust:
+        outliers, weights, first, statistics = find_outliers(engine, first, groups)
+    final = engine.choose(first, weights) if engine.choice.own_axis or engine.choice.cross_axis else first
     if statistics is None or final is not first:
-        statistics = pose_statistics(final, weights, stack)
-    result = _result(engine, options, final, weights, outliers, statistics)
-    return replace(result, seconds=time.perf_counter() - clock, seconds_kernel=seconds_kernel)
+        statistics = pose_statistics(final, weights, engine.stack)
+    return final, weights, outliers, statistics
 
 
 def start_state(evaluator: Evaluator, observations: Sequence[Observations]) -> State:

@@ -5,6 +5,7 @@ many poses and has long tails of its own: there the limit follows the tails, and
 none is left out.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -68,29 +69,45 @@ def pose_statistics(solution: Solution, weights: Array, stack: Stack) -> PoseSta
     )
 
 
-def find_outliers(engine: Engine, solution: Solution) -> tuple[list[int], Array, Solution, PoseStatistics]:
+def find_outliers(
+    engine: Engine, solution: Solution, groups: Sequence[NDArray[np.intp]] | None = None
+) -> tuple[list[int], Array, Solution, PoseStatistics]:
     """Poses to leave out, weights (n,) of all, and the solution without them with its statistics.
 
     The suspects are taken out and all are looked at again, so that one gross error neither makes others look bad nor
-    hides them.
+    hides them. ``groups`` : rows of the poses that are compared with one another (those of one instrument).
     """
     stack = engine.stack
     everything = np.ones(stack.n)
     all_in = solution, pose_statistics(solution, everything, stack)
-    suspects = suspicious(all_in[1].mean_square, stack.used.sum(axis=1), everything)
+    count = stack.used.sum(axis=1)
+    groups = [np.arange(stack.n)] if groups is None else groups
+    suspects = _suspicious_by_group(all_in[1].mean_square, count, everything, groups)
     weights, current = everything, all_in
     for _ in range(4):
-        if not suspects or len(suspects) > max(1, LARGEST_SHARE * stack.n):
+        if not suspects:
             return [], everything, *all_in
         weights = np.ones(stack.n)
         weights[suspects] = 0.0
         solution = engine.solve(solution.state, weights)
         current = solution, pose_statistics(solution, weights, stack)
-        now = suspicious(current[1].mean_square, stack.used.sum(axis=1), weights)
+        now = _suspicious_by_group(current[1].mean_square, count, weights, groups)
         if now == suspects:
             break
         suspects = now
     return np.flatnonzero(weights == 0).tolist(), weights, *current
+
+
+def _suspicious_by_group(
+    square: Array, count: NDArray[np.int64], weights: Array, groups: Sequence[NDArray[np.intp]]
+) -> list[int]:
+    """Suspects of all groups; none of a group in which many are under suspicion."""
+    found: list[int] = []
+    for rows in groups:
+        some = suspicious(square[rows], count[rows], weights[rows])
+        if len(some) <= max(1, LARGEST_SHARE * len(rows)):
+            found += rows[some].tolist()
+    return found
 
 
 def suspicious(square: Array, count: NDArray[np.int64], weights: Array) -> list[int]:

@@ -48,6 +48,10 @@ class Evaluator:
 
     def __init__(self, kernel: Kernel, poses: PoseInputs, stack: Stack) -> None:
         self.kernel, self.poses, self.stack = kernel, poses, stack
+        self.index: Mapping[str, int] = kernel.index
+        self.theta0 = kernel.theta0
+        self._base = [kernel.index[f"base.{k}"] for k in GEOMETRIC_KINDS]
+        self._tool = [kernel.index[f"tool.{k}"] for k in GEOMETRIC_KINDS]
         self._memory: list[tuple[State, Evaluation]] = []
 
     def __call__(self, state: State) -> Evaluation:
@@ -61,6 +65,24 @@ class Evaluator:
         evaluation = Evaluation(T, J, moments, stacked.r, stacked.B)
         self._memory = [(state, evaluation), *self._memory[:2]]
         return evaluation
+
+    def fold(self, theta: Array, state: State) -> State:
+        """A state with moved parameters, deviations of base and tool folded into the references."""
+        W, F = state.world_T_base, state.flange_T_tool
+        if np.any(theta[self._base]):
+            W = W @ tf.frame_from_xyzrpy(theta[self._base])
+        if np.any(theta[self._tool]):
+            F = F @ tf.frame_from_xyzrpy(theta[self._tool])
+        theta[self._base], theta[self._tool] = 0.0, 0.0
+        return State(theta, W, F)
+
+    def deviations(self, state: State) -> Array:
+        """How far each parameter (all) is from where priors expect it."""
+        return state.theta
+
+    def joint_scatter(self, state: State, joint_sigma: ArrayLike) -> Array:
+        """Covariance (n, 6, 6) of the tool's twist from joints that stop with standard deviations ``joint_sigma``."""
+        return joint_scatter(self.kernel, state, self.poses, joint_sigma)
 
 
 class CellEvaluator(Evaluator):
@@ -124,8 +146,6 @@ class Problem:
         at = {int(k): row for row, k in enumerate(self.columns)}
         self.prior = {k: s for k, s in (prior or {}).items() if k in at}
         self._prior_at = [at[k] for k in self.prior]
-        self._base = [self.kernel.index[f"base.{k}"] for k in GEOMETRIC_KINDS]
-        self._tool = [self.kernel.index[f"tool.{k}"] for k in GEOMETRIC_KINDS]
         self._all_used = bool(self.stack.used.all())
 
     def residuals(self, state: State) -> Array:
@@ -156,13 +176,7 @@ class Problem:
         """Add a step to the free parameters and fold base and tool into their references."""
         theta = state.theta.copy()
         theta[self.columns] += step
-        W, F = state.world_T_base, state.flange_T_tool
-        if np.any(theta[self._base]):
-            W = W @ tf.frame_from_xyzrpy(theta[self._base])
-        if np.any(theta[self._tool]):
-            F = F @ tf.frame_from_xyzrpy(theta[self._tool])
-        theta[self._base], theta[self._tool] = 0.0, 0.0
-        return State(theta, W, F)
+        return self.evaluator.fold(theta, state)
 
     def unweighted(self) -> "Problem":
         """The same problem with all poses at full weight, those left out included."""
@@ -174,7 +188,8 @@ class Problem:
     def _with_prior(self, r: Array, state: State) -> Array:
         if not self.prior:
             return r
-        return np.concatenate([r, [-state.theta[k] / s for k, s in self.prior.items()]])
+        off = self.evaluator.deviations(state)
+        return np.concatenate([r, [-off[k] / s for k, s in self.prior.items()]])
 
 
 def whitening(evaluator: Evaluator, state: State, joint_sigma: ArrayLike | None = None) -> Array:
@@ -188,7 +203,7 @@ def whitening(evaluator: Evaluator, state: State, joint_sigma: ArrayLike | None 
     at = evaluator(state)
     C = evaluator.stack.covariance(at.T)
     if joint_sigma is not None:
-        C = C + tf.transport_covariance(at.B, joint_scatter(evaluator.kernel, state, evaluator.poses, joint_sigma))
+        C = C + tf.transport_covariance(at.B, evaluator.joint_scatter(state, joint_sigma))
     L = np.linalg.cholesky(C)
     return np.asarray(np.linalg.solve(L, np.broadcast_to(np.eye(L.shape[-1]), L.shape)))
 

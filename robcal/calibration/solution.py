@@ -84,10 +84,10 @@ class Engine:
         self._normals: tuple[State, Array, Normals] | None = None
         self._rules = limit_rules(self.kernel.model, choice.names)
         self._at = {name: k for k, name in enumerate(choice.names)}
-        self.priors = {self.kernel.index[name]: s for name, s in (priors or {}).items()}
+        self.priors = {evaluator.index[name]: s for name, s in (priors or {}).items()}
 
     def columns(self, names: Sequence[str]) -> list[int]:
-        return [self.kernel.index[n] for n in names]
+        return [self.evaluator.index[n] for n in names]
 
     def problem(self, state: State, names: Sequence[str], weights: Array) -> Problem:
         if self._whitened is None or self._whitened[0] is not state:
@@ -154,7 +154,7 @@ class Engine:
         forced = [n for n in solution.names if n not in own]
         names = (*forced, *own, *cross)
         normals = self.normals(solution.state, names, weights)
-        current = np.array([solution.state.theta[self.kernel.index[n]] for n in (*own, *cross)])
+        current = np.array([solution.state.theta[self.evaluator.index[n]] for n in (*own, *cross)])
         at_zero = normals.shifted(np.concatenate([np.zeros(len(forced)), current]))  # optional parameters at zero
         keep, _ = split_dependent(normals.N, names, self._limits(solution.state, names), ties=False)
         optional = [k for k in keep if k >= len(forced)]
@@ -194,7 +194,7 @@ class Engine:
 
     def _reset(self, state: State, names: Sequence[str]) -> State:
         theta = state.theta.copy()
-        theta[self.columns(names)] = self.kernel.theta0[self.columns(names)]
+        theta[self.columns(names)] = self.evaluator.theta0[self.columns(names)]
         elastic = [k for n, k in zip(names, self.columns(names), strict=True) if ".elastic_" in n]
         theta[elastic] = 0.0
         return State(theta, state.world_T_base, state.flange_T_tool)
@@ -235,9 +235,10 @@ class Engine:
         every = self._normals[2]
         at = [self._at[n] for n in names]
         N, b, square = every.N[np.ix_(at, at)], every.b[at], every.sum_of_squares
+        off = self.evaluator.deviations(state) if self.priors else state.theta
         for k, column in enumerate(self.columns(names) if self.priors else ()):
             if column in self.priors:
-                sigma, value = self.priors[column], state.theta[column]
+                sigma, value = self.priors[column], off[column]
                 N[k, k] += sigma**-2
                 b[k] -= value * sigma**-2
                 square += (value / sigma) ** 2

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from robcal.transforms import Array, frame_from_xyzrpy, xyzrpy_from_frame
+from robcal.transforms import Array, twist_from_six, xyzrpy_from_frame
 
 LOCKED, NEARLY_LOCKED = 1e-3, 0.05
 """Cosine of pitch below which roll and yaw count as turning about one line, and as nearly so."""
@@ -19,26 +19,6 @@ def frame_covariance_columns() -> list[tuple[str, int, int]]:
             unit = "mm2" if j < 3 else "deg2" if i >= 3 else "mm_deg"
             columns.append((f"s{first}{SIX[j]}_{unit}", i, j))
     return columns
-
-
-def twist_from_six(six: Array) -> Array:
-    """(n, 6, 6) Jacobian of the right perturbation (rho, omega) of a frame by its numbers x, y, z, roll, pitch, yaw.
-
-    With R = Rz(yaw) Ry(pitch) Rx(roll): rho = R' dt, and the body's turn is the sum of the rates about the line that
-    each angle turns about: omega = droll ex + Rx' dpitch ey + Rx' Ry' dyaw ez.
-    """
-    zero = np.zeros_like(six)
-    roll, pitch = zero.copy(), zero.copy()
-    roll[:, 3], pitch[:, 4] = six[:, 3], six[:, 4]
-    Rx = frame_from_xyzrpy(roll)[:, :3, :3]
-    Ry = frame_from_xyzrpy(pitch)[:, :3, :3]
-    R = frame_from_xyzrpy(six)[:, :3, :3]
-    jacobian = np.zeros((len(six), 6, 6))
-    jacobian[:, :3, :3] = np.swapaxes(R, 1, 2)
-    jacobian[:, 3, 3] = 1.0
-    jacobian[:, 3:, 4] = np.swapaxes(Rx, 1, 2)[:, :, 1]
-    jacobian[:, 3:, 5] = (np.swapaxes(Rx, 1, 2) @ np.swapaxes(Ry, 1, 2))[:, :, 2]
-    return jacobian
 
 
 def frame_columns(T: Array) -> dict[str, list[str]]:

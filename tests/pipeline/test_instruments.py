@@ -1,0 +1,114 @@
+"""Campaigns with several instruments: from their files to result.json and predict --instrument; truth from fixtures."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fixtures.instruments import Watcher, placement, watch, write_watched
+from fixtures.plan import Plan
+from pipeline.campaign import read_campaign
+from pipeline.prediction import predict_run
+from pipeline.runner import run_campaign
+from robcal.errors import InvalidInput
+from robcal.files.tables import read_table
+
+PLAN = Plan(seed=3, poses=120, verify=15, model="table5.4", kept_out=2)
+TURNS = [f"{end}.{kind}" for end in ("world_T_base", "flange_T_tool") for kind in ("roll", "pitch", "yaw")]
+
+
+@pytest.fixture(scope="module")
+def wires_and_tracker(tmp_path_factory):  # type: ignore[no-untyped-def]
+    """Two wires identify, a tracker verifies."""
+    folder = tmp_path_factory.mktemp("wires")
+    wire = Watcher("distances", poses="identify", sigma_mm=0.02)
+    made = watch(PLAN, {"tracker": Watcher(poses="verify"), "left": wire, "right": wire})
+    write_watched(folder / "campaign", made)
+    run_campaign(folder / "campaign", out=folder / "run", until="verify")
+    return made, folder
+
+
+def test_lengths_identify_and_frames_verify(wires_and_tracker) -> None:  # type: ignore[no-untyped-def]
+    _, folder = wires_and_tracker
+    result = json.loads((folder / "run" / "result.json").read_text())
+    wire, tracker = result["instruments"]["left"], result["instruments"]["tracker"]
+    assert (wire["kind"], wire["poses"], wire["held"]) == ("distances", 120, TURNS)
+    assert 0.8 < wire["sigma0"] < 1.2
+    assert (tracker["kind"], tracker["poses"], tracker["sigma0"]) == ("frames", 0, None)
+    assert result["verification"]["tools"] == tracker["verification"]["tools"]
+    assert tracker["verification"]["tools"]["0"]["mean"] < 0.15
+    assert tracker["verification"]["nominal"]["0"]["mean"] > 2.0
+
+
+def test_predictions_are_made_in_the_world_of_the_named_instrument(wires_and_tracker) -> None:  # type: ignore[no-untyped-def]
+    made, folder = wires_and_tracker
+    poses, out = folder / "campaign" / "poses.csv", folder / "f.csv"
+    predict_run(folder / "run", poses, out)
+    by_default = _places(out)
+    assert np.linalg.norm(by_default - made.frames("tracker")[:, :3, 3], axis=1).mean() < 3e-4
+    predict_run(folder / "run", poses, out, instrument="right")
+    lengths = np.linalg.norm(_places(out), axis=1)
+    assert np.abs(lengths - np.linalg.norm(made.frames("right")[:, :3, 3], axis=1)).mean() < 1e-4
+    with pytest.raises(InvalidInput, match="did you mean 'right'"):
+        predict_run(folder / "run", poses, out, instrument="rihgt")
+
+
+def _places(path: Path) -> np.ndarray:
+    table = read_table(path)
+    return np.column_stack([table.numbers(f"{n}_mm") for n in "xyz"]) / 1000
+
+
+def test_a_known_base_and_tool_serve_a_campaign_with_one_instrument(tmp_path: Path) -> None:
+    made = watch(Plan(seed=5, poses=30, verify=8, kept_out=2, model=("axis1.yaw", "axis4.roll")), {"a": Watcher()})
+    folder = write_watched(tmp_path, made)
+    base, tool = (placement(T["a"]) | {"free": "none"} for T in (made.world_T_base, made.flange_T_tool))
+    text = (folder / "campaign.yaml").read_text()
+    start = text.index("instruments:")
+    end = text.index("model:")
+    stated = f"measurements: a.csv\nworld_T_base: {json.dumps(base)}\nflange_T_tool: {json.dumps(tool)}\n"
+    (folder / "campaign.yaml").write_text(text[:start] + stated + text[end:])
+    instrument = read_campaign(folder).instruments["measurements"]
+    assert instrument.world.unknown == ()
+    assert instrument.tool.unknown == ()
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"same_tool": [["a", "c"]]}, "same_tool: there is no instrument 'c'"),
+        ({"world_T_base": {"xyz_mm": [0, 0, 0]}}, "serves a campaign with one instrument"),
+        ({"instruments": {"a": {"measurements": "a.csv", "mounted": "hand"}}}, "state 'mounted: world'"),
+        ({"instruments": {"a": {"measurements": "a.csv", "body": "x"}}}, "there is no body 'x'"),
+        (
+            {"instruments": {"a": {"measurements": "a.csv", "world_T_base": {"free": ["x"]}}}},
+            "world_T_base of instrument 'a': y is not free but has no value",
+        ),
+        (
+            {
+                "instruments": {
+                    "a": {
+                        "measurements": "a.csv",
+                        "world_T_base": {"rpy_deg": [0, 90, 0], "free": ["x", "y", "z", "yaw"]},
+                    }
+                }
+            },
+            "roll and yaw turn about one line",
+        ),
+    ],
+)
+def test_contradictions_are_refused_in_one_sentence(tmp_path: Path, change: dict, sentence: str) -> None:
+    made = watch(Plan(seed=5, poses=8, verify=2, kept_out=2), {"a": Watcher()})
+    folder = write_watched(tmp_path, made, **change)
+    with pytest.raises(InvalidInput, match=sentence):
+        read_campaign(folder)
+
+
+def test_an_instrument_whose_rows_share_no_pose_with_the_joint_angles_is_named(tmp_path: Path) -> None:
+    made = watch(Plan(seed=5, poses=8, verify=2, kept_out=2), {"a": Watcher(), "b": Watcher()})
+    folder = write_watched(tmp_path, made)
+    (folder / "b.csv").write_text((folder / "b.csv").read_text().replace("\np", "\nx"))
+    with pytest.raises(InvalidInput, match=r"instrument 'b': .*b\.csv, row 2: pose 'x001' is not in the table"):
+        read_campaign(folder)
