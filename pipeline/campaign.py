@@ -251,6 +251,11 @@ class _Reader:
             where = "measures in the hand" if table.kind == "sensor_points" else f"has {table.kind}"
             wanted = "mounted: hand" if table.kind == "sensor_points" else "mounted: world"
             raise self._error(("instruments", name), f"instrument '{name}' {where}: state '{wanted}'")
+        if use.pulley is not None and (table.kind != "distances" or not any(use.pulley.axis)):
+            raise self._error(
+                ("instruments", name, "pulley"),
+                f"instrument '{name}' has {table.kind}: a pulley belongs to distances, and its axis needs a direction",
+            )
         self._check_targets(table, bodies)
 
     def _error(self, place: tuple[str | int, ...], message: str) -> InvalidInput:

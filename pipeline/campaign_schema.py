@@ -147,12 +147,21 @@ class CellFrameEntry(Entry):
     sigma_deg: Positive | None = None
 
 
+class PulleyEntry(Entry):
+    """A wheel over which a wire leaves: held, not identified."""
+
+    radius_mm: Positive
+    axis: Triple = (0.0, 0.0, 1.0)
+    free: Literal["none"] = "none"
+
+
 class InstrumentEntry(Entry):
     """A measuring system with a world and a tool of its own."""
 
     measurements: Annotated[list[Text], BeforeValidator(_one_or_many)]
     world_T_base: CellFrameEntry | None = None
     flange_T_tool: CellFrameEntry | None = None
+    pulley: PulleyEntry | None = None
     mounted: Literal["world", "hand"] = "world"
     body: Text | None = None
 

@@ -5,10 +5,12 @@ from dataclasses import replace
 from pipeline.artifacts import FRAMES, POINTS
 from pipeline.bodies import body_for_robot, surveyed_or_given
 from pipeline.campaign import Campaign
+from pipeline.campaign_schema import InstrumentEntry
 from pipeline.runs import Run
 from robcal.calibration.instruments import Instrument
 from robcal.calibration.measurements import RobotObservations, RobotRecording, frame_observations, used_points
-from robcal.calibration.observations import FrameObservations
+from robcal.calibration.observations import DistanceObservations, FrameObservations
+from robcal.calibration.pulley import Pulley
 from robcal.errors import InvalidInput
 from robcal.files.recordings import observations_of
 from robcal.photogrammetry.core.bodies import Body
@@ -30,11 +32,18 @@ def build_instruments(campaign: Campaign, run: Run) -> list[Instrument]:
             seen = source.entry.body if source.entry is not None and source.entry.body else campaign.carried_body
             body = surveyed_or_given(campaign, run, seen) if seen is not None else None
             tables = source.tables or ()
-            observations = tuple(observations_of(table, body) for table in tables)
+            observations = tuple(_over_pulley(observations_of(table, body), source.entry) for table in tables)
             stated = all(table.covariance is not None for table in tables)
             recording = RobotRecording(observations, observations, stated)
         out.append(Instrument(name, recording, source.world, source.tool))
     return out
+
+
+def _over_pulley(made: RobotObservations, entry: InstrumentEntry | None) -> RobotObservations:
+    """Lengths as drawn over the pulley of their instrument, if it has one."""
+    if entry is None or entry.pulley is None or not isinstance(made, DistanceObservations):
+        return made
+    return replace(made, pulley=Pulley(entry.pulley.radius_mm / 1000.0, entry.pulley.axis))
 
 
 def build_recording(campaign: Campaign, run: Run, body: Body | None) -> RobotRecording:

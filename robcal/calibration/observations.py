@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from robcal import transforms as tf
+from robcal.calibration.pulley import Pulley
 from robcal.errors import InvalidInput
 from robcal.photogrammetry.core.camera import Camera, project_with_jacobians
 
@@ -220,11 +221,12 @@ class DistanceObservations(_Rows):
 
     Attributes
     ----------
-    pose : (m,); distance, sigma : (m,) m.
+    pose : (m,); distance, sigma : (m,) m. pulley : over which the wire leaves, None where it leaves from a point.
     """
 
     distance: Array
     sigma: Array
+    pulley: Pulley | None = None
     dimension: ClassVar[int] = 1
 
     def __post_init__(self) -> None:
@@ -239,6 +241,11 @@ class DistanceObservations(_Rows):
     def evaluate(self, T: Array) -> tuple[Array, Array]:
         """Distance residual; derivative along the direction to the tool, in tool coordinates."""
         t = T[self.pose, :3, 3]
+        if self.pulley is not None:
+            length, gradient = self.pulley.length(t)
+            B = np.zeros((len(t), 1, 6))
+            B[:, 0, :3] = np.einsum("mi,mij->mj", gradient, T[self.pose, :3, :3])
+            return (self.distance - length)[:, None], B
         length = np.maximum(np.linalg.norm(t, axis=1), 1e-12)
         B = np.zeros((len(t), 1, 6))
         B[:, 0, :3] = np.einsum("mi,mij->mj", t / length[:, None], T[self.pose, :3, :3])

@@ -19,6 +19,9 @@ from robcal.recipe.verification import FOLDS, RobotVerification
 from robcal.robot.kernel import Kernel
 from robcal.robot.model import RobotModel
 
+USUAL_LENGTH, SURE = 2e-4, 2.0
+"""Deviation of a link (m) that is usual; one that is larger by this many standard deviations is told."""
+
 
 def identify_from_instruments(
     model: RobotModel, log: JointLog, instruments: Sequence[Instrument], options: IdentifyOptions | None = None
@@ -44,10 +47,37 @@ def identify_from_instruments(
             start = model.with_parameters({**model.parameters, **slips[0].values})
             notes.append(f"{slips[0].statement}; {slips[0].remedy}")
     found = identify_instruments(start, log, instruments, options)
+    found = replace(found, notes=(*found.notes, *length_alarms(found)))
     silent = [i.name for i in instruments if not i.recording.stated]
     if silent:
         notes.append(f"{' and '.join(silent)}: no uncertainty is stated, it is estimated from the residuals")
     return replace(found, notes=(*notes, *found.notes))
+
+
+def length_alarms(found: IdentifiedInstruments) -> list[str]:
+    """Lengths that links do not have, where a robot was identified from lengths of wires alone.
+
+    Sag, stretch or a wrong scale of a wire fit into the robot with small residuals and make it worse.
+    """
+    identified = [p for p in found.placed.values() if p.robot is not None]
+    robot = identified[0].robot
+    if robot is None or any(p.instrument.dimension > 1 for p in identified):
+        return []
+    frames = {f.name for f in robot.model.frames}
+    odd = [
+        f"{name} {1e3 * value:+.2f} +- {1e3 * sigma:.2g} mm"
+        for name, value, sigma in zip(robot.names, robot.theta, robot.sigma, strict=True)
+        if (parts := name.rpartition("."))[0] in frames
+        and parts[2] in ("x", "y", "z")
+        and abs(value) - SURE * sigma > USUAL_LENGTH
+    ]
+    if not odd:
+        return []
+    return [
+        f"identified from wires alone, lengths are off by more than links usually are ({1e3 * USUAL_LENGTH:g} mm): "
+        f"{', '.join(odd)}; a wire that sags, stretches or has a wrong scale or pulley does that with small residuals: "
+        "verify in 6D before driving with this robot"
+    ]
 
 
 def leading_identification(found: IdentifiedInstruments) -> Identification:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fixtures.effects import Effect
 from fixtures.instruments import Watcher, placement, watch, write_watched
 from fixtures.plan import Plan
 from pipeline.campaign import read_campaign
@@ -112,3 +113,19 @@ def test_an_instrument_whose_rows_share_no_pose_with_the_joint_angles_is_named(t
     (folder / "b.csv").write_text((folder / "b.csv").read_text().replace("\np", "\nx"))
     with pytest.raises(InvalidInput, match=r"instrument 'b': .*b\.csv, row 2: pose 'x001' is not in the table"):
         read_campaign(folder)
+
+
+@pytest.mark.parametrize("modelled", [True, False])
+def test_a_pulley_in_the_model_gives_the_right_robot_and_one_left_out_an_alarm(tmp_path: Path, modelled: bool) -> None:
+    wrap = Effect("pulley_wrap", "wire", parameters={"radius_mm": 40.0})
+    wire = Watcher("distances", poses="identify", sigma_mm=0.02, effects=(wrap,))
+    model = ("axis2.pitch", "axis2.x", "axis3.pitch", "axis3.x", "axis5.pitch")
+    plan = Plan(seed=3, poses=80, verify=10, model=model, kept_out=2, compliance=False)
+    made = watch(plan, {"tracker": Watcher(poses="verify"), "wire": wire})
+    pulley = {"pulley": {"radius_mm": 40.0, "axis": [0, 0, 1]}} if modelled else {}
+    write_watched(tmp_path / "campaign", made, {"wire": pulley})
+    run_campaign(tmp_path / "campaign", out=tmp_path / "run", until="verify")
+    error = json.loads((tmp_path / "run" / "result.json").read_text())["verification"]["tools"]["0"]["mean"]
+    log = (tmp_path / "run" / "log.txt").read_text()
+    assert (error < 0.12) == modelled
+    assert modelled or "verify in 6D before driving" in log
