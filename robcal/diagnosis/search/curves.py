@@ -6,7 +6,7 @@ Gaussian process with period one turn, and the poses of whole blocks that were k
 true. A curve that a few waves describe as well is left to the causes with a name.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -17,10 +17,10 @@ from robcal.diagnosis.core.recording import Recording
 from robcal.diagnosis.gain.heldout import folds, rms
 from robcal.diagnosis.scan.statistics import log_f_probability
 from robcal.diagnosis.scan.tangents import Tangents, tangents
-from robcal.diagnosis.search.shared_curve import Likeness, maker, pattern, refined
+from robcal.diagnosis.search.shared_curve import Likeness, joined, maker, pattern, refined
 from robcal.physics.angle_error_curve import Placed, beside_shared, periodic_curve
 from robcal.physics.cause import Array, LinearCause, RobotCause
-from robcal.physics.site import RobotSite
+from robcal.physics.site import Joint, RobotSite
 from robcal.robot.model import Term
 
 LEAST_POSES = 150
@@ -37,7 +37,9 @@ WAVES = 2
 HIGHEST_WAVE = 60.0
 IRREGULAR = 0.35
 """Share of a curve's variance that so many waves leave: below, the curve is regular and has a name."""
-OWN_SIZES = (1.0, 0.3, 0.1)
+BUMPS_SHARED = 72
+"""Bumps a turn of a curve that joints share: all of them together show its finest waves."""
+OWN_SIZES = (0.3, 0.6, 0.1)
 """Sizes, in those of a curve, of what joints that share one may differ by; the kept-out poses choose."""
 HELD_PARTS = 20
 """Bumps in one expression of a curve that is held."""
@@ -122,7 +124,7 @@ def find_curves(present: Fit, recording: Recording) -> Curves:
     alone = _accepted(present, [causes[k] for k in keep], [columns[k] for k in keep])
     alike = likenesses(alone, [site.variables[f"q{joints[k].number}"] for k in keep])
     group = _Group(present, at, label, [causes[k] for k in keep], [columns[k] for k in keep])
-    chosen = _with_shared(group, pattern([joints[k] for k in keep], alike), dict(site.variables), len(joints))
+    chosen = _with_shared(group, pattern([joints[k] for k in keep], alike), [joints[k] for k in keep], len(joints))
     accepted, used = (alone, group.columns) if chosen is None else chosen
     r = present.residual
     square = float(r @ r)
@@ -158,37 +160,60 @@ def _accepted(present: Fit, causes: Sequence[RobotCause], columns: Sequence[Arra
     )
 
 
+@dataclass(frozen=True)
+class _Shared:
+    """A pattern with its curve on trial: sum of squares at kept-out poses, size of what joints differ by."""
+
+    kept_out: float
+    size: float
+    placed: tuple[Placed, ...]
+    cause: RobotCause
+    columns: tuple[Array, ...]
+
+
 def _with_shared(
-    group: _Group, placed: Sequence[Placed], variables: dict[str, Array], count: int
+    group: _Group, placed: Sequence[Placed], joints: Sequence[Joint], count: int
 ) -> tuple[tuple[Accepted, ...], list[Array]] | None:
     """One curve for the joints of a pattern, and what each differs by, where that predicts kept-out poses better."""
     if len(placed) < LEAST_SHARED:
         return None
-    bumps = group.columns[0].shape[1]
-    make, everyone = maker(bumps, variables, count), range(len(group.columns) + 1)
-    members = {p.joint.where for p in placed}
-    small = [1.0 if f.where not in members else OWN_SIZES[-1] for f in group.causes]
+    make = maker(BUMPS_SHARED, group.at.variables, count)
 
     def solve(columns: Sequence[Array]) -> list[Array]:
         return _solve(group.present, columns)
 
-    beside = [c * s for c, s in zip(group.columns, small, strict=True)]
-    shared = make(refined(placed, make, group.at, solve, beside))
-    common = group.at.columns(shared, shared.grid[0]) * shared.sizes(shared.grid[0])
-    best = _folded(group.present, group.columns, group.label).kept_out(everyone[:-1])
-    chosen = None
-    for size in OWN_SIZES:
-        scale = [size if f.where in members else 1.0 for f in group.causes]
-        own = [c * s for c, s in zip(group.columns, scale, strict=True)]
-        after = _folded(group.present, [common, *own], group.label).kept_out(everyone)
-        if after < best:
-            best, chosen = after, (scale, own)
-    if chosen is None:
+    placed = refined(placed, make, group.at, solve, _beside(group, placed, OWN_SIZES[0]))
+    found = _tried(group, placed, make, OWN_SIZES[0])
+    for joint in (j for j in joints if j.where not in {p.joint.where for p in placed}):
+        # joints whose own poses show too little of their curve to tell that it is the same
+        others = [c for f, c in zip(group.causes, found.columns[1:], strict=True) if f.where != joint.where]
+        seen = joined(group.present, group.at, found.cause, joint, found.columns[0], others, _solve)
+        if seen is not None:
+            more = (*found.placed, seen)
+            more = refined(more, make, group.at, solve, _beside(group, more, found.size))
+            found = min(found, _tried(group, more, make, found.size), key=lambda t: t.kept_out)
+    trials = [found, *(_tried(group, found.placed, make, size) for size in OWN_SIZES[1:])]
+    found = min(trials, key=lambda t: t.kept_out)
+    alone = _folded(group.present, group.columns, group.label).kept_out(range(len(group.columns)))
+    if found.kept_out > alone:
         return None
-    scale, own = chosen
-    causes = [f if s == 1.0 else beside_shared(f, s) for f, s in zip(group.causes, scale, strict=True)]
-    columns = [common, *own]
-    return _accepted(group.present, [shared, *causes], columns), columns
+    members = {p.joint.where for p in found.placed}
+    causes = [beside_shared(f, found.size) if f.where in members else f for f in group.causes]
+    return _accepted(group.present, [found.cause, *causes], found.columns), list(found.columns)
+
+
+def _beside(group: _Group, placed: Sequence[Placed], size: float) -> list[Array]:
+    """Scaled columns of the joints' own curves, `size` times as large for those that share one."""
+    members = {p.joint.where for p in placed}
+    return [c * (size if f.where in members else 1.0) for f, c in zip(group.causes, group.columns, strict=True)]
+
+
+def _tried(group: _Group, placed: tuple[Placed, ...], make: Callable[..., RobotCause], size: float) -> _Shared:
+    """A pattern beside curves of all joints, those of its members `size` times as large."""
+    own, cause = _beside(group, placed, size), make(placed)
+    common = group.at.columns(cause, cause.grid[0]) * cause.sizes(cause.grid[0])
+    after = _folded(group.present, [common, *own], group.label).kept_out(range(len(own) + 1))
+    return _Shared(after, size, placed, cause, (common, *own))
 
 
 def _visited(angles: Array, bumps: int) -> int:

@@ -6,17 +6,25 @@ steps. Joints that differ keep a curve of what they differ by, whose size the ke
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from robcal.diagnosis.core.fitting import Fit
+from robcal.diagnosis.scan.statistics import orthonormal_basis
 from robcal.diagnosis.scan.tangents import Tangents
 from robcal.physics.angle_error_curve import Placed, shared_curve
 from robcal.physics.cause import Array, RobotCause
 from robcal.physics.site import Joint
 
 ROUNDS = 4
+TURNS, TABLE = 240, 1441
+"""Turns that are tried, and points of the curve's table."""
+ELSEWHERE = np.deg2rad(8.0)
+"""Turns farther apart than this are different answers."""
+BEYOND_DOUBT = 1.5
+"""Factor by which the best turn must explain more than any other."""
 STEP = 1e-4
 """rad, over which a curve is differentiated."""
 LARGEST_TURN = 0.05
@@ -87,6 +95,52 @@ def refined(
     return placed
 
 
+def joined(
+    present: Fit,
+    at: Tangents,
+    cause: RobotCause,
+    joint: Joint,
+    common: Array,
+    others: Sequence[Array],
+    solve: Callable[[Fit, Sequence[Array]], list[Array]],
+) -> Placed | None:
+    """How the curve that other joints share sits in one more joint: the turn and sense that explain most there, if no
+    other explains nearly as much.
+
+    Parameters
+    ----------
+    cause, common : the shared curve and its scaled columns. others : scaled columns of all other curves but the
+        joint's own.
+    """
+    columns = [common, *others]
+    values = solve(present, columns)
+    left = present.residual - np.sum([c @ v for c, v in zip(columns, values, strict=True)], axis=0)
+    grid = np.linspace(0.0, 2.0 * np.pi, TABLE)
+    own = cause.laws(cause.grid[0])[: len(values[0])]
+    name, sizes = cause.covariates[0], cause.sizes(cause.grid[0])
+    height = np.sum([s * v * b.value({name: grid}) for b, v, s in zip(own, values[0], sizes, strict=True)], axis=0)
+    q, motion = at.variables[f"q{joint.number}"], at.motion[joint.frame, "q"]
+    basis = orthonormal_basis(present.jacobian)
+    turns = np.linspace(0.0, 2.0 * np.pi, TURNS, endpoint=False)
+    gains = []
+    for sense in (1, -1):
+        for part in np.array_split(turns, 8):
+            law = sense * np.interp((sense * q[:, None] + part) % (2.0 * np.pi), grid, height)
+            trial = at.recording.beside_common(motion[:, None] * law[at.row_pose])
+            trial = trial - basis @ (basis.T @ trial)
+            along = np.clip(left @ trial, 0.0, None)
+            gains.append(along**2 / np.maximum(np.sum(trial**2, axis=0), 1e-300))
+    gain = np.concatenate(gains)
+    best = int(np.argmax(gain))
+    away = np.abs((turns - turns[best % TURNS] + np.pi) % (2.0 * np.pi) - np.pi) > ELSEWHERE
+    rivals = np.concatenate([away, away])
+    rivals[:TURNS] |= best >= TURNS
+    rivals[TURNS:] |= best < TURNS
+    if gain[best] < BEYOND_DOUBT * np.max(gain[rivals]):
+        return None
+    return Placed(joint, 1 if best < TURNS else -1, float(turns[best % TURNS]))
+
+
 def _slope(
     placed: tuple[Placed, ...], k: int, make: Callable[[Sequence[Placed]], RobotCause], at: Tangents, values: Array
 ) -> Array:
@@ -96,7 +150,7 @@ def _slope(
     return np.asarray((ahead - behind) / (2.0 * STEP))
 
 
-def maker(bumps: int, variables: dict[str, Array], count: int) -> Callable[[Sequence[Placed]], RobotCause]:
+def maker(bumps: int, variables: Mapping[str, Array], count: int) -> Callable[[Sequence[Placed]], RobotCause]:
     """The cause of a pattern with so many bumps a turn; count : number of the robot's turning joints."""
 
     def make(placed: Sequence[Placed]) -> RobotCause:
