@@ -25,7 +25,7 @@ OPTIONS = IdentifyOptions(MODEL, statics="converged", covariance="stated")
 
 
 def errors(seed: int) -> tuple[float, float, float, int]:
-    """RMS errors (mm) at the kept-out poses: nominal, identified, predicted; and how many parameters were identified."""
+    """RMS errors (mm) at the kept-out poses: nominal, identified, predicted; and how many parameters were found."""
     plan = Plan(seed=seed, poses=336, verify=0, model=MODEL, kept_out=500)
     made = watch(plan, {"wire": Watcher("distances", sigma_mm=0.05)})
     with tempfile.TemporaryDirectory() as place:
