@@ -236,18 +236,21 @@ def poses(
 def export(
     run_folder: RunOrDrift,
     c: Annotated[Path | None, typer.Option("--c", help="Folder for C99 source of the model and its inverse.")] = None,
+    table: Annotated[
+        Path | None, typer.Option("--table", help="Table of parameters for C source exported before (CSV).")
+    ] = None,
     urdf: Annotated[Path | None, typer.Option("--urdf", help="URDF file of the calibrated robot.")] = None,
     at_cycle: AtCycle = None,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
     """Export the calibrated robot for controllers and simulators."""
-    if c is None and urdf is None:
-        wrong_use("name what to write: --c FOLDER, --urdf FILE, or both")
+    if c is None and urdf is None and table is None:
+        wrong_use("name what to write: --c FOLDER, --urdf FILE, --table FILE")
     with answers("export", as_json, quiet) as answer:
         from pipeline.exports import export_run
 
-        written = export_run(run_folder, c, urdf, at_cycle)
+        written = export_run(run_folder, c, urdf, table, at_cycle)
         answer["files"] = [str(path) for path in written]
         for path in written:
             LOG.info(str(path))

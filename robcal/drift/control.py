@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import groupby
 from typing import Literal
 
 import numpy as np
@@ -28,6 +29,8 @@ SLOW = 0.1
 """Share by which one tour changes the noise that is expected of the next."""
 
 
+LEAST_NOISE = 0.2
+"""Readings are not taken for better than this share of their stated variance."""
 HELD_SHARE = 0.1
 """While a jump is on, so much of the thermal change is allowed for."""
 
@@ -118,6 +121,25 @@ class Events:
     uses: dict[int, Use] = field(default_factory=dict)
 
 
+@dataclass(frozen=True)
+class _Open:
+    """A reading of the tour that is not complete: a row of what was taken in together."""
+
+    number: int
+    source: Readings
+    row: int
+
+    @property
+    def cycle(self) -> int:
+        return int(self.source.cycle[self.row])
+
+
+def _runs(rows: Sequence[_Open]) -> list[tuple[Readings, tuple[int, ...]]]:
+    """Neighbours that came in together."""
+    groups = groupby(rows, key=lambda row: id(row.source))
+    return [(members[0].source, tuple(m.row for m in members)) for members in (list(g) for _, g in groups)]
+
+
 class DriftControl:
     """Takes readings in one after the other.
 
@@ -131,9 +153,9 @@ class DriftControl:
     ) -> None:
         self.reference = reference
         self.state = state
-        self._open: dict[int, tuple[int, Readings]] = {}
+        self._open: dict[int, _Open] = {}
         for number, reading in open_rows:
-            self._open[int(reference.slots(reading)[0])] = (number, reading)
+            self._open[int(reference.slots(reading)[0])] = _Open(number, reading, 0)
         self._tours: list[Tour] = []
         self._alarms: list[Alarm] = []
         self._uses: dict[int, Use] = {}
@@ -152,11 +174,11 @@ class DriftControl:
         slots = self.reference.slots(readings)
         self._tours, self._alarms, self._uses = [], [], {}
         for i in np.argsort(readings.cycle, kind="stable"):
-            self._take_one(int(numbers[i]), int(slots[i]), readings.subset([int(i)]))
+            self._take_one(int(slots[i]), _Open(int(numbers[i]), readings, int(i)))
         return Events(tuple(self._tours), tuple(self._alarms), dict(self._uses))
 
-    def _take_one(self, number: int, slot: int, reading: Readings) -> None:
-        cycle, time = int(reading.cycle[0]), float(reading.time[0])
+    def _take_one(self, slot: int, reading: _Open) -> None:
+        number, cycle, time = reading.number, reading.cycle, float(reading.source.time[reading.row])
         if cycle < self.state.closed_cycle:
             if time > self.state.newest_time:
                 self._alarm(cycle, "clock", f"cycle {cycle} comes after cycle {self.state.newest_cycle}: number on")
@@ -165,11 +187,11 @@ class DriftControl:
         self._pass_time(cycle, time)
         former = self._open.get(slot)
         if former is not None:
-            older = int(former[1].cycle[0]) > cycle
-            self._uses[number if older else former[0]] = "replaced"
+            older = former.cycle > cycle
+            self._uses[number if older else former.number] = "replaced"
             if older:
                 return
-        self._open[slot] = (number, reading)
+        self._open[slot] = reading
         self._uses[number] = "open"
         if len(self._open) == len(self.reference.poses):
             self._close()
@@ -195,15 +217,15 @@ class DriftControl:
         )
 
     def _expire(self) -> None:
-        for number, _ in self._open.values():
-            self._uses[number] = "expired"
+        for reading in self._open.values():
+            self._uses[reading.number] = "expired"
         self._open = {}
 
     def _watch_age(self, cycle: int) -> None:
         state, settings = self.state, self.reference.settings
-        if state.stale:
+        if state.stale or not (state.paused or state.running > settings.stale):
             return
-        begun = min(int(r.cycle[0]) for _, r in self._open.values())
+        begun = min(reading.cycle for reading in self._open.values())
         if state.paused and cycle > begun:
             text = (
                 f"after a standstill of {state.paused / 60:.0f} min the tour was not measured as a whole before "
@@ -223,12 +245,13 @@ class DriftControl:
 
     def _close(self) -> None:
         order = sorted(self._open)
-        numbers = [self._open[slot][0] for slot in order]
-        readings = joined([self._open[slot][1] for slot in order])
+        rows = [self._open[slot] for slot in order]
+        numbers = [row.number for row in rows]
+        readings = joined([part.subset(list(at)) for part, at in _runs(rows)])
         self._open = {}
         slots = np.array(order, dtype=np.int64)
         state = self.state
-        fit = fit_drift(self.reference, readings, slots, state.model.change, max(1.0, state.noise))
+        fit = fit_drift(self.reference, readings, slots, state.model.change, max(LEAST_NOISE, state.noise))
         cycle, time = int(readings.cycle.max()), float(readings.time.max())
         trouble = self._trouble(readings, slots, fit, time)
         accepted = trouble is None

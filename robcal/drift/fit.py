@@ -13,6 +13,8 @@ from robcal.estimation.gauss_newton import solve_step
 from robcal.transforms import Array
 
 MEDIAN = float(stats.chi2.median(3))
+GROSS = float(stats.chi2.isf(1e-6, 3))
+"""Squared normalised residual (3 coordinates) beyond which a reading is a gross error."""
 
 
 @dataclass(frozen=True)
@@ -84,14 +86,13 @@ def fit_drift(
     """
     kept = np.ones(len(readings), dtype=bool)
     linear = linearise(reference, readings, slots, in_force, noise)
-    limit = float(stats.chi2.isf(1e-6, 3))
     while True:
         change = _solve(reference, linear, in_force, kept)
         covariance = _covariance(reference, linear, kept)
         size = _sizes(reference, linear, change - in_force, covariance, kept)
         scale = max(1.0, float(np.median(size[kept])) / MEDIAN)
         worst = int(np.argmax(np.where(kept, size, -1.0)))
-        if size[worst] <= limit * scale or kept.sum() <= max(6, len(kept) // 2):
+        if size[worst] <= GROSS * scale or kept.sum() <= max(6, len(kept) // 2):
             break
         kept[worst] = False
     # drift is small: a second step, with the derivatives of the first, moves the targets by nanometres

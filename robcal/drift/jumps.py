@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import linalg, stats
+from scipy import linalg, special
 
 from robcal import transforms as tf
 from robcal.drift.fit import Linearised
@@ -66,19 +66,24 @@ def find_jump(reference: DriftReference, slots: Ints, linear: Linearised, elapse
     m, p = len(slots), len(reference.names)
     share = allowed_share(elapsed, reference.settings.time_constant)
     A = linear.A.reshape(3 * m, p)
-    S = linalg.block_diag(*linear.C) + A @ (np.diag((share * reference.sizes) ** 2) + model) @ A.T
+    S = A @ (np.diag((share * reference.sizes) ** 2) + model) @ A.T
+    S.reshape(m, 3, m, 3)[np.arange(m), :, np.arange(m)] += linear.C
     factor = linalg.cho_factor(S, check_finite=False)
-    best, score = None, -np.inf
-    for what, H in _hypotheses(reference, slots).items():
-        weighted = linalg.cho_solve(factor, H, check_finite=False)
-        normal = weighted.T @ H
-        estimate = np.linalg.lstsq(normal, weighted.T @ linear.r.ravel(), rcond=1e-9)[0]
+    hypotheses = _hypotheses(reference, slots)
+    every = np.concatenate(list(hypotheses.values()), axis=1)
+    weighted = linalg.cho_solve(factor, every, check_finite=False)
+    normals, right = weighted.T @ every, weighted.T @ linear.r.ravel()
+    best, score, first = None, -np.inf, 0
+    for what, H in hypotheses.items():
+        at = slice(first, first := first + H.shape[1])
+        normal = normals[at, at]
+        estimate = np.linalg.pinv(normal, rcond=1e-9, hermitian=True) @ right[at]
         gain = float(estimate @ normal @ estimate)
         way = float(np.mean(np.linalg.norm((H @ estimate).reshape(-1, 3), axis=1)))
         size = way if what == "body" else float(abs(estimate[0]))
         # a body's six numbers fit more than a joint's one by chance (Akaike 1974)
         if gain - 2 * H.shape[1] > score:
-            best, score = Jump(what, size, float(stats.chi2.sf(gain, H.shape[1]))), gain - 2 * H.shape[1]
+            best, score = Jump(what, size, float(special.chdtrc(H.shape[1], gain))), gain - 2 * H.shape[1]
     if best is None or best.p_value >= reference.settings.level:
         return None
     return best if best.size > reference.settings.least_jump[0 if best.what == "body" else 1] else None

@@ -7,7 +7,7 @@ do the body's own coordinates: targets need to be at rest, not known.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -133,13 +133,13 @@ class DriftReference:
     sizes: Array
     settings: DriftSettings = DriftSettings()
 
-    @property
+    @cached_property
     def kernel(self) -> Kernel:
         """The robot with the sensor as its tool."""
         kernel = kernel_of(self.robot.model, self.robot.statics)
         return kernel if self.sensor is None else kernel.with_references(None, self.sensor)
 
-    @property
+    @cached_property
     def columns(self) -> NDArray[np.intp]:
         """Indices of the drifting parameters in the kernel's theta."""
         index = self.kernel.index
@@ -251,4 +251,4 @@ def freeze(
     kept = choose_parameters(made, one_tour, required=parameters is not None)
     if not len(kept):
         raise NotIdentifiable("the tour can tell none of the parameters that drift: measure from more directions")
-    return DriftReference(**{**made.__dict__, "names": tuple(names[i] for i in kept), "sizes": size[kept]})
+    return replace(made, names=tuple(names[i] for i in kept), sizes=size[kept])

@@ -235,3 +235,27 @@ def test_a_state_is_not_begun_twice_nor_without_a_run(made: Path, state: Path, t
         "init", made / "run", "--readings", reference, "--state", new, "--parameters", "axis7.x"
     )
     assert not new.exists()
+
+
+@pytest.mark.browser
+def test_the_page_opens_in_a_browser(made: Path, state: Path, tmp_path: Path) -> None:
+    playwright = pytest.importorskip("playwright.sync_api")
+    chromium = shutil.which("chromium")
+    if chromium is None:
+        pytest.skip("needs Chromium")
+    for file in files(made):
+        call("add", state, file)
+    page_file = tmp_path / "drift.html"
+    call("status", state, "--page", page_file)
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
+        page = browser.new_page()
+        faults: list[str] = []
+        page.on("pageerror", lambda error: faults.append(str(error)))
+        page.on("request", lambda request: faults.append(request.url) if request.url.startswith("http") else None)
+        page.goto(page_file.as_uri())
+        page.wait_for_function("document.documentElement.dataset.drawn === '3'", timeout=60_000)
+        assert "5 tours" in page.inner_text("body")
+        assert page.locator(".plot .main-svg").count() >= 3
+        browser.close()
+    assert not faults

@@ -1,9 +1,10 @@
 """A calibrated robot as C99 source for a controller: forward model and corrected commands.
 
-The forward model is the kernel's graph with all identified numbers inserted (elasticities and extra terms included);
-the payload enters at run time by mass and centre of gravity. The inverse is the nominal robot's, in closed form where
-its joint lines allow one (:mod:`robcal.robot.structure`), Levenberg-Marquardt otherwise. Nothing is allocated; only
-``math.h`` and ``string.h`` are included.
+The forward model is the kernel's graph (elasticities and extra terms included); its parameters stand in a table that
+can be replaced while the controller runs, as a drift control does; the payload enters at run time by mass and centre
+of gravity. The inverse is the nominal robot's, in closed form where its joint lines allow one
+(:mod:`robcal.robot.structure`), Levenberg-Marquardt otherwise. Nothing is allocated; only ``math.h`` and ``string.h``
+are included.
 
 The algorithms are the C files in ``c/``, which include each other as usual; which arm, which inverse is chosen by the
 macros ARM, CLOSED_FORM and INVERSE. Exported is one file: the robot's numbers (``robot_data.h.j2``), then the C files
@@ -81,7 +82,8 @@ def export_c(
     if not re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII):
         raise InvalidInput(f"'{name}' cannot begin the names of C functions: give a prefix of letters and digits")
     kernel = Kernel(model, statics)
-    body, covariates = _real_robot(kernel)
+    table = parameter_table(model)
+    body, covariates = _real_robot(kernel, table)
     # a '*/' in a name must not end the comment
     common = {"prefix": name, "title": re.sub(r"[^\w .,()+-]", "_", model.name)}
     inverse, choices = _inverse(kernel)
@@ -93,12 +95,25 @@ def export_c(
             joints=model.n_joints,
             covariates=covariates,
             payloads=_payloads(kernel),
+            parameters=table,
             defaults=[(defaults or {}).get(covariate, 0.0) for covariate in covariates] or [0.0],
         )
     )
-    data = _environment().get_template("robot_data.h.j2").render(common, **inverse, real_robot=body)
+    data = _environment().get_template("robot_data.h.j2").render(common, **inverse, real_robot=body, parameters=table)
     source = f"/* {common['title']} */\n{data}{_amalgamated('commands.c', choices, {'robot_data.h'})}"
     return CSource(f"{name}.h", header, f"{name}.c", source, covariates, data, choices)
+
+
+def parameter_table(model: RobotModel) -> dict[str, float]:
+    """Parameters that stand in the table, by name: all that the model has, but those of payloads, base and tool.
+
+    Base and tool are constants because the inverse uses them as well; payloads come with every call.
+    """
+    kernel = Kernel(model)
+    held = ("payload.", "base.", "tool.")
+    own = {*kernel.model.parameters, *(f"{t.name}.{k}" for t in kernel.model.terms for k in t.parameters)}
+    values = zip(kernel.names, kernel.theta0.tolist(), strict=True)
+    return {name: value for name, value in values if name in own and not name.startswith(held)}
 
 
 @cache
@@ -137,8 +152,8 @@ def _amalgamated(name: str, choices: Mapping[str, str], done: set[str]) -> str:
     return "".join(before) + "\n" + "\n".join(own) + "\n"
 
 
-def _real_robot(kernel: Kernel) -> tuple[str, tuple[str, ...]]:
-    """Body of world_T_tool(q, load, covariates), entries row by row, and the covariates' names."""
+def _real_robot(kernel: Kernel, table: Mapping[str, float]) -> tuple[str, tuple[str, ...]]:
+    """Body of world_T_tool(q, load, covariates, parameters), entries row by row, and the covariates' names."""
     model, statics = kernel.model, kernel.statics
     numbers = dict(zip(kernel.names, kernel.theta0, strict=True))
     # the payload of the call: a load of zero nominal mass whose deviations are the arguments
@@ -152,14 +167,18 @@ def _real_robot(kernel: Kernel) -> tuple[str, tuple[str, ...]]:
     names = Kernel(loaded, statics).names
     load = ca.SX.sym("load", 4)
     arguments = {f"payload.{_LOAD}.{k}": load[i] for i, k in enumerate(("mass", "x", "y", "z"))}
+    parameters = ca.SX.sym("parameters", max(1, len(table)))
+    arguments |= {name: parameters[i] for i, name in enumerate(table)}
     inserted = ca.vertcat(*(arguments[n] if n in arguments else ca.SX(float(numbers.get(n, 0.0))) for n in names))
     T = ca.substitute(
         [graph.world_T_tool],
         [theta, one_hot, W0, F0],
         [inserted, ca.SX(1.0), ca.SX(ca.DM(kernel.world_T_base[:3])), ca.SX(ca.DM(kernel.flange_T_tool[:3]))],
     )[0]
-    function = ca.Function("real_robot", [q, load, covariates], [ca.densify(ca.reshape(T.T, 12, 1))], {"cse": True})
-    return function_body(function, ("q", "load", "covariate"), ("T",)), graph.covariates
+    function = ca.Function(
+        "real_robot", [q, load, covariates, parameters], [ca.densify(ca.reshape(T.T, 12, 1))], {"cse": True}
+    )
+    return function_body(function, ("q", "load", "covariate", "ROBOT(parameters)"), ("T",)), graph.covariates
 
 
 def _payloads(kernel: Kernel) -> list[dict[str, Any]]:

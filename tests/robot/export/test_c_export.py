@@ -134,6 +134,22 @@ def test_terms_covariates_and_payload_are_exported(statics, tmp_path):
         assert bot.forward(q[k], conditions) == pytest.approx(expected[k], abs=1e-12)
 
 
+def test_a_table_of_parameters_replaces_another_at_run_time(tmp_path) -> None:
+    model = real_robot("kr150_class", np.random.default_rng(4))
+    bot = Compiled(model, tmp_path)
+    names = [
+        n for n in Kernel(model).names if n in model.parameters and not n.startswith(("payload.", "base.", "tool."))
+    ]
+    changed = replace(model, parameters={**model.parameters, "axis2.x": 0.0012, "axis3.pitch": -0.003})
+    table = (ctypes.c_double * len(names)).in_dll(bot.library, "bot_parameters")
+    table[:] = [changed.parameters[name] for name in names]
+    kernel = Kernel(changed)
+    q = regular_poses(model, 5, np.random.default_rng(1))
+    expected = kernel.frames(kernel.theta0, kernel.poses(q))
+    for k in range(len(q)):
+        assert bot.forward(q[k], bot.conditions()) == pytest.approx(expected[k], abs=1e-12)
+
+
 def test_every_function_of_the_term_language_reaches_c(tmp_path):
     text = (
         "1e-3*(sin(q1)+cos(q1)+tan(q1/9)+asin(q1/9)+acos(q1/9)+atan(q1)+atan2(q1,2)+sinh(q1)+cosh(q1)+tanh(q1)+exp(q1)"
