@@ -83,8 +83,10 @@ class Draw:
 
     def tool(self) -> tuple[CellFrame, Array]:
         """Tool from six touches of the tip, two of x and two of xy."""
-        offsets = [np.zeros(3)] * 6 + [np.array([0.1, 0, 0])] * 2 + [np.array([0.03, 0.09, 0])] * 2
-        q = np.concatenate([self.touched(TOOL, self.tip[None], o) for o in offsets])
+        offsets = {6: [0, 0, 0], 2: [0.1, 0, 0], -2: [0.03, 0.09, 0]}
+        q = np.concatenate(
+            [self.touched(TOOL, np.tile(self.tip, (abs(n), 1)), np.array(o)) for n, o in offsets.items()]
+        )
         return tool_from_touches(self.carried(q, FLANGE), ["tip"] * 6 + ["x"] * 2 + ["xy"] * 2), TOOL
 
     def object(self, tool: PlacedFrame, how: str) -> tuple[CellFrame, Array]:

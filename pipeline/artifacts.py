@@ -23,6 +23,7 @@ if TYPE_CHECKING:  # a stage depends on the types that it uses, not on those of 
     from robcal.photogrammetry.survey.types import SurveyResult
     from robcal.recipe.evidence import Evidence
     from robcal.recipe.identification import Identification
+    from robcal.recipe.verification import RobotVerification
     from robcal.transforms import Array
 
 T = TypeVar("T")
@@ -53,6 +54,10 @@ CALIBRATED: Artifact[CalibratedRobot] = Artifact("calibrated", "diagnose")
 EVIDENCE: Artifact[Evidence] = Artifact("evidence", "diagnose")
 CORRECTED: Artifact[RobotRecording] = Artifact("corrected", "diagnose")
 """The recording without what was found in the measuring system."""
+PLACED: Artifact[RobotRecording] = Artifact("placed", "diagnose")
+"""The recording in the frame of its first pose, where the station or the base moved or a zero jumped."""
+DELIVERED: Artifact[RobotVerification] = Artifact("delivered", "diagnose")
+"""The verification of the robot in force."""
 RELATIVE_COVARIANCE: Artifact[Array] = Artifact("relative", "diagnose")
 """Covariance (p, p) of the robot's parameters where the errors of the station are known."""
 VERIFICATION: Artifact[tuple[Verification, Rows]] = Artifact("verify", "verify")

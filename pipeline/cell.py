@@ -1,7 +1,5 @@
 """Commands of the cell: tables of touches in, frames and points with their covariance out."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any

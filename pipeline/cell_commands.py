@@ -1,7 +1,5 @@
 """Commands `pipeline cell ...`: tool, objects, base and points of a calibrated robot's cell."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Any
 

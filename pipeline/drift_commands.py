@@ -1,7 +1,5 @@
 """Commands of the drift control: ``pipeline drift init | add | status | watch | rollback``."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Any
 

@@ -1,7 +1,5 @@
 """The robot that a command works with: of a finished run, or of a drift control with the model in force."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from pipeline.runs import open_run

@@ -1,7 +1,5 @@
 """What the commands of a drift control do: init, add, status, watch, rollback."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The database of a drift control: SQLite in one file, or PostgreSQL by URL. One transaction holds all or nothing."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager

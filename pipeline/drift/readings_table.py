@@ -1,7 +1,5 @@
 """Readings of a sensor in the hand from a table: ``cycle, time_s, pose, target, x_mm, y_mm, z_mm`` and more."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

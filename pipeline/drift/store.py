@@ -1,7 +1,5 @@
 """A drift control between two calls: what is read from its database and what is written back."""
 
-from __future__ import annotations
-
 import io
 import json
 import tempfile

@@ -79,15 +79,16 @@ def _robot(material: Material, v: Verification) -> Verdict:
         else f"Cross-validated: each of {v.poses} poses predicted by a robot identified without it"
     )
     reason = f"{kept}; {percent(v.coverage_95)} of them lie inside the predicted 95 % region."
-    if "0" in noise:
-        reason += f" The measurement alone scatters by {number(noise['0'] * 1e3)} mm (RMS) at the tool's origin."
+    reason += _measurement(material.result.get("noise") or {})
     reason += _taken_out(material, v)
     load = (
         "robot_calibrated.yaml; corrected targets or joint angles by 'pipeline compensate', code for the controller by "
         "'pipeline export'."
     )
-    if grade == "bad":
-        load = "Keep the nominal robot until the doubts are settled."
+    if before is not None and after.rms >= before.rms:
+        load = "Keep the nominal robot: the identified one is no better at poses that were kept out."
+    elif grade == "bad":
+        load = "Settle the doubts before anything is loaded into the controller."
     return Verdict(
         grade,
         word,
@@ -98,6 +99,17 @@ def _robot(material: Material, v: Verification) -> Verdict:
         _keys(material, v, noise, gain),
         error_table(v, noise, full=False),
     )
+
+
+_SOURCES = {"stated": "as stated", "repeats": "from repeated poses", "lengths": "from lengths on the body"}
+
+
+def _measurement(noise: Mapping[str, Any]) -> str:
+    """What the measurement alone scatters by, from the source that holds; what the model misses is no part of it."""
+    source, value = _SOURCES.get(str(noise.get("source"))), noise.get("measurement_mm")
+    if source is None or value is None:
+        return ""
+    return f" The measurement alone scatters by {number(float(value))} mm (RMS; {source})."
 
 
 def _taken_out(material: Material, v: Verification) -> str:

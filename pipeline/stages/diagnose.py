@@ -11,14 +11,18 @@ from pipeline.campaign import Campaign
 from pipeline.json_io import write_json
 from pipeline.messages import LOG
 from pipeline.stages.base import Context, Outcome, Stage, no_files
+from pipeline.stages.identify import options_of
+from pipeline.stages.survey import located
 from robcal.diagnosis.content import diagnosis_content, with_exchanges, with_images
 from robcal.diagnosis.core.result import Diagnosis
 from robcal.diagnosis.images.diagnosis import ImageFinding
 from robcal.diagnosis.search.selection import SelectionSettings
+from robcal.errors import InvalidInput
 from robcal.files.tables import write_table
 from robcal.photogrammetry.station.contradictions import TARGET_SWAPPED
 from robcal.recipe.robot_diagnosis import Measured, RobotDiagnosis, diagnose_robot
 from robcal.recipe.robot_witness import with_station_moves
+from robcal.recipe.verification import kept_out_gain
 
 NAME = "diagnose"
 
@@ -45,11 +49,18 @@ def work(context: Context) -> Outcome:
     content = with_images(diagnosis_content(diagnosis), images.findings, images.scans, images.noise)
     if station is not None and found.recording.own_station:
         content = with_station_moves(content, station.names, found.recording, diagnosis.model)
-    content = content | _in_force(found)
+    options = options_of(campaign, identification.recording.stated)
+    try:
+        before, delivered = kept_out_gain(campaign.robot, identification, found, campaign.poses, options)
+    except InvalidInput as error:
+        raise located(error, str(campaign.poses.path)) from None
+    gain = {"before": 1e3 * before, "after": 1e3 * delivered.delivered.tools["0"].rms}
+    content = content | _in_force(found) | {"heldout_mm": {**_table(content["heldout_mm"]), **gain}}
     exchanges = measured.points.exchanges if measured.points is not None else ()
     content = with_exchanges(content, exchanges, campaign.poses.names)
     write_json(run.diagnosis, content)
     outputs = [run.diagnosis, run.save(artifacts.CALIBRATED, found.robot), run.save(artifacts.EVIDENCE, found.evidence)]
+    outputs.append(run.save(artifacts.DELIVERED, delivered))
     if content.get("next_poses"):
         write_table(run.next_poses, _columns(content["next_poses"]))
         outputs.append(run.next_poses)
@@ -57,12 +68,15 @@ def work(context: Context) -> Outcome:
         outputs.append(run.save(artifacts.RELATIVE_COVARIANCE, found.relative))
     if found.corrected is not None:
         outputs.append(run.save(artifacts.CORRECTED, found.corrected))
+    if found.placed is not None:
+        outputs.append(run.save(artifacts.PLACED, found.placed))
     told = [f.statement for f in images.findings] + [f.statement for f in diagnosis.findings]
     told = [f"targets {x.targets[0]} and {x.targets[1]} exchanged in {len(x.poses)} pose(s)" for x in exchanges] + told
     notes = told or ["nothing missing: the model explains the data"]
     if diagnosis.findings:
         notes = [*notes, found.in_force.reason]
-    outcome = _result(diagnosis) | {"mismatch": content["mismatch"], "p_value": content["p_value"]} | _in_force(found)
+    outcome = _result(diagnosis) | {key: content[key] for key in ("mismatch", "p_value", "heldout_mm")}
+    outcome |= _in_force(found)
     swapped = [{"cause": TARGET_SWAPPED.name, "where": str(x.targets[0]), "direction": None} for x in exchanges]
     outcome["causes"] = [*swapped, *_named(images.findings), *_result(diagnosis)["causes"]]
     return Outcome({"diagnosis": outcome}, outputs, notes)
@@ -78,6 +92,10 @@ def _in_force(found: RobotDiagnosis) -> dict[str, Any]:
         "in_force_reason": decided.reason,
         "delivered_mm": {"identified": 1e3 * decided.identified, "diagnosed": 1e3 * decided.diagnosed_error},
     }
+
+
+def _table(content: object) -> dict[str, Any]:
+    return dict(content) if isinstance(content, dict) else {}
 
 
 def settings_of(campaign: Campaign) -> SelectionSettings:
@@ -97,16 +115,10 @@ def _named(findings: Sequence[ImageFinding]) -> list[dict[str, Any]]:
 
 
 def _result(diagnosis: Diagnosis) -> dict[str, Any]:
-    before, after, floor = (v * 1000 for v in diagnosis.heldout)
     causes: Sequence[dict[str, Any]] = [
         {"cause": f.cause.name, "where": f.cause.where, "direction": f.cause.direction} for f in diagnosis.findings
     ]
-    return {
-        "mismatch": diagnosis.mismatch,
-        "p_value": diagnosis.p_value,
-        "causes": causes,
-        "heldout_mm": {"before": before, "after": after, "noise_floor": floor},
-    }
+    return {"mismatch": diagnosis.mismatch, "p_value": diagnosis.p_value, "causes": causes}
 
 
 STAGE = Stage(
@@ -114,7 +126,7 @@ STAGE = Stage(
     applies=lambda campaign: campaign.entry.diagnosis.enabled,
     work=work,
     inputs=no_files,
-    settings=lambda campaign: campaign.entry.diagnosis.model_dump(),
+    settings=lambda campaign: campaign.entry.model_dump(include={"diagnosis", "model"}),
     after=("survey", "orient", "identify"),
     module=__name__,
 )

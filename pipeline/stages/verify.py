@@ -47,9 +47,8 @@ def work(context: Context) -> Outcome:
     identification = run.load(artifacts.IDENTIFICATION)
     calibrated = load_calibrated(run)
     diagnosed = run.record("diagnose") is not None
-    # what the diagnosis found in the measuring system is no error of the robot
-    freed = run.find(artifacts.CORRECTED) if diagnosed else None
-    relative = run.find(artifacts.RELATIVE_COVARIANCE) if diagnosed else None
+    placed = run.find(artifacts.PLACED) if diagnosed else None
+    delivered = run.find(artifacts.DELIVERED) if diagnosed else None
     options = options_of(campaign, identification.recording.stated)
     instruments = run.find(artifacts.INSTRUMENTS)
     verified: dict[str, Verification] = {}
@@ -58,7 +57,8 @@ def work(context: Context) -> Outcome:
             verified = verify_instruments(robot, instruments, poses, options)
             found = telling_verification(instruments, verified)
         else:
-            found = verify_robot(robot, identification, calibrated, poses, options, freed, relative)
+            # a diagnosis has verified already what it delivers
+            found = delivered or verify_robot(robot, identification, calibrated, poses, options)
     except InvalidInput as error:
         raise located(error, str(poses.path)) from None
     write_robot(run.robot, calibrated.model, f"calibrated from campaign {campaign.name}")
@@ -70,8 +70,10 @@ def work(context: Context) -> Outcome:
         run.covariance,
         run.residuals,
     ]
-    datum = "" if instruments is not None else datum_note(identification, calibrated, poses)
+    datum = "" if instruments is not None else datum_note(identification, calibrated, poses, placed)
     notes = [*found.notes, *_approach_note(found), *filter(None, [datum])]
+    if placed is not None:
+        notes.append("errors are against the measurements in the frame of the first pose, the moves found taken back")
     diagnosis = read_json(run.diagnosis) if diagnosed and run.diagnosis.is_file() else None
     judged = verdict(
         robot_facts(identification, calibrated, poses, found.delivered, diagnosis, doubtful_coordinates(run))

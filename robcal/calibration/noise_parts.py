@@ -29,6 +29,8 @@ DISAGREE = 3.0
 """Factor between two figures of the measurement noise from which their disagreement is told."""
 WRONG = 10.0
 """Factor from which a stated sigma is not believed."""
+CLIP = 4.0
+"""Robust standard deviations beyond which a length is a wrong one."""
 FEWEST = 10
 """Degrees of freedom that a figure needs to count."""
 
@@ -159,9 +161,10 @@ def _lengths(observations: Sequence[Observations]) -> float | None:
                 length = np.linalg.norm(place[:, i] - place[:, k], axis=1)
                 length = length[np.isfinite(length)]
                 if len(length) > 1:
-                    # robust: single wrong points say nothing about the noise
+                    # single wrong points say nothing about the noise; a median alone would be a poor estimate of it
                     off = np.abs(length - np.median(length))
-                    square += (1.4826 * float(np.median(off))) ** 2 * (len(length) - 1)
-                    freedom += len(length) - 1
+                    sound = off[off <= CLIP * 1.4826 * max(float(np.median(off)), 1e-300)]
+                    square += float(np.sum(sound**2))
+                    freedom += len(sound) - 1
     # a length scatters by the root of two of what a coordinate does, a point by the root of three
     return float(np.sqrt(1.5 * square / freedom)) if freedom >= FEWEST else None

@@ -170,6 +170,7 @@ def cross_validate(
     folds: int = 5,
     groups: ArrayLike | None = None,
     kernel: Kernel | None = None,
+    stated: PoseInputs | None = None,
 ) -> Verification:
     """k-fold verification; every choice (parameters, outliers) is made anew in each fold, on its own poses alone.
 
@@ -177,6 +178,7 @@ def cross_validate(
     ----------
     groups : (n,) labels of poses that must stay together; default: repetitions of one another.
     folds : number of folds; groups are dealt out in turn, so every fold covers the whole time.
+    stated : the poses as they would be stated to predict, where that is less than what was recorded.
 
     Raises
     ------
@@ -198,7 +200,7 @@ def cross_validate(
         here = poses.subset(inside)
         robot = identify(model, here, train, chosen, kernel)
         nominal = fit_nominal(model, here, train, chosen)
-        there = poses.subset(out)
+        there = (poses if stated is None else stated).subset(out)
         T, C_T = robot.predict(there)
         square, degrees = _normalised(robot, there, test, T, C_T)
         parts.append((out, T, C_T, square, degrees, tool_errors(T, test), tool_errors(nominal.predict(there)[0], test)))

@@ -7,8 +7,6 @@ stated it is estimated by restricted maximum likelihood (Patterson and Thompson 
 distribution with the degrees of freedom of the mixture (Satterthwaite 1946).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TypeVar

@@ -1,7 +1,5 @@
 """Frames that a calibrated robot carries, in base coordinates: what is uncertain about them, and what they share."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -58,7 +56,7 @@ class CarriedFrames:
     def __len__(self) -> int:
         return len(self.T)
 
-    def subset(self, rows: ArrayLike) -> CarriedFrames:
+    def subset(self, rows: ArrayLike) -> "CarriedFrames":
         """The poses of the given rows."""
         at = np.asarray(rows, dtype=np.intp)
         return CarriedFrames(self.T[at], self.names, self.covariance, self.J[at], self.scatter[at])

@@ -1,7 +1,5 @@
 """Tool, object and base frames from touches and matched frames."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 

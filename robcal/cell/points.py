@@ -1,7 +1,5 @@
 """The calibrated robot as a measuring machine."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 

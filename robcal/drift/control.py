@@ -4,8 +4,6 @@ Readings come singly, in parts of a tour spread over cycles of production. When 
 the parameters are identified, tested, and, if nothing speaks against it, put in force. Nothing is stored here.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import groupby

@@ -1,7 +1,5 @@
 """The parameters that explain how targets at rest have moved for the sensor since the reference."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -5,8 +5,6 @@ only. What the tour shows beyond that is compared with what a displaced body or 
 ratio of likelihoods (Kay 1998, Detection Theory, section 7.3), under the covariance of noise and possible drift.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

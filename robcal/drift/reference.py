@@ -4,8 +4,6 @@ Only changes against the reference count afterwards, so that errors of the model
 do the body's own coordinates: targets need to be at rest, not known.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -73,7 +71,7 @@ class Readings:
     def __len__(self) -> int:
         return len(self.x)
 
-    def subset(self, rows: Ints | NDArray[np.bool_] | Sequence[int]) -> Readings:
+    def subset(self, rows: Ints | NDArray[np.bool_] | Sequence[int]) -> "Readings":
         """Some of the rows (indices or mask)."""
         chosen = np.asarray(rows)
         at = np.arange(len(self))[chosen if chosen.dtype == bool else chosen.astype(np.intp)]

@@ -11,6 +11,7 @@ from robcal.errors import InvalidInput
 from robcal.files.schemas import Entry, NotNegative, Positive, Text, Triple, Whole, read_entry
 from robcal.files.storage import write_text
 from robcal.files.yaml_io import FlowMapping, yaml_text
+from robcal.imaging.ring_code import canonical_id, is_id
 from robcal.photogrammetry.core.bodies import Body
 from robcal.transforms import Array
 
@@ -145,10 +146,10 @@ def check_ring_codes(body: BodyFile) -> None:
             continue
         if not 0 <= code < 4096:
             raise InvalidInput(f"{body.path}: {code} is no ring12 id: twelve segments give 0 to 4095")
-        smallest = min(((code << k) | (code >> (12 - k))) & 0xFFF for k in range(12))
-        if smallest != code:
+        if not is_id(code):
             raise InvalidInput(
-                f"{body.path}: {code} is no ring12 id: the id is the smallest of its cyclic readings, here {smallest}"
+                f"{body.path}: {code} is no ring12 id: the id is the smallest of its cyclic readings, here "
+                f"{canonical_id(code)}"
             )
 
 

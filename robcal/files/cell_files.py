@@ -1,7 +1,5 @@
 """Files of the cell: touches and nominal points in, frames and points with their covariance out."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -5,8 +5,6 @@ error. Where no joint ever was the amplitudes stay zero with the uncertainty of 
 need. Joints with a copy of the same part share one curve `c`: the error of each is `sense c(sense q + shift)`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

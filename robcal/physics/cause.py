@@ -197,6 +197,25 @@ class Entry:
     on_observations: Callable[[ObservationData, tuple[int, ...], str], Iterable[ObservationCause]] | None = None
 
 
+def amplitude_phase(values: Array, factor: float = DEG) -> tuple[float, float]:
+    """Amplitude of a wave, ``values`` (2,) of cosine and sine, times ``factor``, and its phase in degrees."""
+    return float(np.hypot(*values) * factor), float(np.degrees(np.arctan2(values[1], values[0])))
+
+
+def report_wave(values: Array, constants: Constants) -> dict[str, object]:
+    """Order, amplitude and phase (deg) of a wave; whole orders as whole numbers."""
+    amplitude, phase = amplitude_phase(values)
+    order, nearest = constants["order"], round(constants["order"])
+    whole = abs(order - nearest) < 1e-6
+    return {"order": nearest if whole else order, "amplitude_deg": amplitude, "phase_deg": phase}
+
+
+def report_move(values: Array, constants: Constants) -> dict[str, object]:
+    """Pose from which on something stands elsewhere, its shift and its turn from ``values`` (6,), m and rad."""
+    shift, turn = [float(x) * 1e3 for x in values[:3]], [float(x) * DEG for x in values[3:]]
+    return {"pose": constants["pose"], "shift_mm": shift, "turn_deg": turn}
+
+
 def numeric_sigma(
     report: Report, values: Array, constants: Constants, covariance: Array
 ) -> tuple[dict[str, object], dict[str, object]]:

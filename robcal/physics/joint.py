@@ -6,8 +6,18 @@ from dataclasses import replace
 import numpy as np
 
 from robcal.cause import Kind
-from robcal.physics.cause import LEAST_MOMENT, PER_KNM, Array, Basis, Constants, Entry, RobotCause
-from robcal.physics.site import Joint, RobotSite, breaks, each_joint, evenly, exponential_law
+from robcal.physics.cause import (
+    LEAST_MOMENT,
+    PER_KNM,
+    Array,
+    Basis,
+    Constants,
+    Entry,
+    RobotCause,
+    amplitude_phase,
+    report_wave,
+)
+from robcal.physics.site import Joint, RobotSite, breaks, each_joint, evenly, exponential_law, waves
 from robcal.robot.terms import identifier
 
 STIFFNESS_NONLINEAR = Kind(
@@ -77,10 +87,6 @@ from deviations of a few mrad, whose sign friction hides."""
 HIGHEST_RIPPLE_ORDER = 180
 LARGEST = np.radians(0.5)
 """rad (or m): no gear, encoder or reference of a robot that works is off by more."""
-
-
-def _amplitude_phase(values: Array, factor: float) -> tuple[float, float]:
-    return float(np.hypot(*values) * factor), float(np.degrees(np.arctan2(values[1], values[0])))
 
 
 def _compliance(site: RobotSite, joint: Joint) -> Iterator[RobotCause]:
@@ -254,13 +260,6 @@ def _zero_jump(site: RobotSite, joint: Joint) -> Iterator[RobotCause]:
     )
 
 
-def _harmonic(k: int, frame: str, kind: str, order: float) -> tuple[Basis, Basis]:
-    return (
-        Basis(frame, kind, f"cos(order*q{k})", "cosine", {"order": order}),
-        Basis(frame, kind, f"sin(order*q{k})", "sine", {"order": order}),
-    )
-
-
 def _eccentricity(site: RobotSite, joint: Joint) -> Iterator[RobotCause]:
     return _periodic(joint, JOINT_ECCENTRICITY, 3e-4, (1, 2))
 
@@ -274,20 +273,14 @@ def _periodic(joint: Joint, kind: Kind, size: float, orders: Iterable[int]) -> I
     if joint.prismatic:
         return
 
-    def report(v: Array, c: Constants) -> dict[str, object]:
-        amplitude, phase = _amplitude_phase(v, np.degrees(1.0))
-        nearest = round(c["order"])
-        order = nearest if abs(c["order"] - nearest) < 1e-6 else c["order"]
-        return {"order": order, "amplitude_deg": amplitude, "phase_deg": phase}
-
     yield RobotCause(
         kind,
         *joint.place,
         ("cosine", "sine"),
         (size, size),
-        report,
+        report_wave,
         grid=tuple({"order": float(order)} for order in orders),
-        bases=lambda c: _harmonic(joint.number, joint.frame, "q", c["order"]),
+        bases=lambda c: waves(joint, "q", c["order"]),
         covariates=(f"q{joint.number}",),
         limits=(-LARGEST, LARGEST),
     )
@@ -333,12 +326,11 @@ def _counterbalance(site: RobotSite) -> Iterator[RobotCause]:
     for rank, (largest, elastic, joint) in enumerate(loaded):
 
         def report(v: Array, c: Constants) -> dict[str, object]:
-            amplitude, phase = _amplitude_phase(v, 1.0)
+            amplitude, phase = amplitude_phase(v, 1.0)
             return {"torque_Nm": amplitude, "phase_deg": phase}
 
         def bases(c: Constants, joint: Joint = joint, elastic: float = elastic) -> tuple[Basis, ...]:
-            waves = _harmonic(joint.number, joint.frame, "q", 1.0)
-            return tuple(replace(wave, template=f"{elastic!r}*{wave.template}") for wave in waves)
+            return tuple(replace(wave, template=f"{elastic!r}*{wave.template}") for wave in waves(joint, "q", 1.0))
 
         size = max(0.2 * largest, 1.0)
         yield RobotCause(
@@ -354,15 +346,10 @@ def _counterbalance(site: RobotSite) -> Iterator[RobotCause]:
         )
 
 
-def _warming(frame: str, kind: str, law: tuple[str, dict[str, float]], parameter: str) -> Basis:
-    return Basis(frame, kind, law[0], parameter, law[1])
-
-
 def _zero_drift(site: RobotSite, joint: Joint) -> Iterator[RobotCause]:
     for name in site.temperatures():
-        first = float(site.variables[name][int(np.argmin(site.variables["index"]))])
 
-        def bases(c: Constants, law: str = f"({name} - {first!r})") -> tuple[Basis, ...]:
+        def bases(c: Constants, law: str = site.warmed(name)) -> tuple[Basis, ...]:
             return (Basis(joint.frame, "q", law, "drift"),)
 
         yield RobotCause(
@@ -379,6 +366,11 @@ def _zero_drift(site: RobotSite, joint: Joint) -> Iterator[RobotCause]:
     duration = site.duration_h()
     if duration > 0:
         start = float(np.min(site.variables["time_s"]))
+
+        def warming(c: Constants) -> Basis:
+            law, constants = exponential_law(start, duration, c["tau_h"])
+            return Basis(joint.frame, "q", law, "drift", constants)
+
         yield RobotCause(
             THERMAL_ZERO_DRIFT,
             *joint.place,
@@ -388,7 +380,7 @@ def _zero_drift(site: RobotSite, joint: Joint) -> Iterator[RobotCause]:
             "The zero of {where} drifts by {" + f"{joint.unit}_per_h" + ":.5f} " + joint.unit + " per hour",
             grid=tuple({"tau_h": share * duration} for share in (0.1, 0.25, 0.6, 3.0)),
             continuous={"tau_h": (0.02 * duration, 10.0 * duration)},
-            bases=lambda c: (_warming(joint.frame, "q", exponential_law(start, duration, c["tau_h"]), "drift"),),
+            bases=lambda c: (warming(c),),
             covariates=("time_s",),
             weight=0.5,
         )

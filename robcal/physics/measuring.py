@@ -12,7 +12,7 @@ import numpy as np
 
 from robcal.cause import Kind
 from robcal.photogrammetry.station.contradictions import CAMERA_MOVED, TARGET_SHIFTED, TARGET_SWAPPED
-from robcal.physics.cause import DEG, Array, Constants, Entry, ObservationCause, ObservationData
+from robcal.physics.cause import DEG, Array, Constants, Entry, ObservationCause, ObservationData, report_move
 from robcal.physics.refraction import refraction_causes
 from robcal.physics.site import breaks
 
@@ -165,11 +165,7 @@ def _station(data: ObservationData) -> Iterator[ObservationCause]:
         None,
         ("x", "y", "z", "rx", "ry", "rz"),
         (1e-3, 1e-3, 1e-3, 5e-4, 5e-4, 5e-4),
-        lambda v, c: {
-            "pose": c["pose"],
-            "shift_mm": [float(x) * 1e3 for x in v[:3]],
-            "turn_deg": [float(x) * DEG for x in v[3:]],
-        },
+        report_move,
         "The station moved before pose {pose}",
         grid=tuple({"pose": i} for i in first),
         ordered={"pose": every},

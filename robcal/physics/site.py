@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from robcal.physics.cause import DEFLECTION, DEG, LEAST_MOMENT, Array, RobotCause
+from robcal.physics.cause import DEFLECTION, DEG, LEAST_MOMENT, Array, Basis, RobotCause
 from robcal.robot.model import RobotModel
 
 ANGLE_OF_AXIS = {"x": "roll", "y": "pitch", "z": "yaw"}
@@ -97,6 +97,11 @@ class RobotSite:
         """Recorded temperatures that change by more than 0.2 K, enough to speak of."""
         return tuple(v for v in self.variables if v.startswith("temp_") and self.varies(v, 0.2))
 
+    def warmed(self, name: str) -> str:
+        """Template of a temperature's change since the first pose."""
+        first = float(self.variables[name][int(np.argmin(self.variables["index"]))])
+        return f"({name} - {first!r})"
+
     def compliance(self, moment: str, least: float) -> float:
         """Typical compliance (rad/(N m)) for a moment that was recorded: `least`, or more where loads are small, since
         small robots are softer in proportion."""
@@ -120,6 +125,15 @@ def breaks(index: Array, margin: int, most: int = MOST_BREAKS) -> tuple[tuple[fl
         return every, every
     chosen = np.unique(np.linspace(0, len(every) - 1, most).round().astype(int))
     return tuple(every[i] for i in chosen), every
+
+
+def waves(joint: Joint, kind: str, order: float) -> tuple[Basis, Basis]:
+    """Cosine and sine of a multiple of a joint's angle, added to a number of its frame."""
+    argument, constants = f"order*q{joint.number}", {"order": order}
+    return (
+        Basis(joint.frame, kind, f"cos({argument})", "cosine", constants),
+        Basis(joint.frame, kind, f"sin({argument})", "sine", constants),
+    )
 
 
 def exponential_law(start_s: float, duration_h: float, tau_h: float) -> tuple[str, dict[str, float]]:

@@ -5,9 +5,21 @@ from collections.abc import Iterator
 import numpy as np
 
 from robcal.cause import Kind
-from robcal.physics.cause import DEG, LEAST_MOMENT, PER_KNM, Array, Basis, Constants, Entry, Report, RobotCause
+from robcal.physics.cause import (
+    DEG,
+    LEAST_MOMENT,
+    PER_KNM,
+    Array,
+    Basis,
+    Constants,
+    Entry,
+    Report,
+    RobotCause,
+    report_move,
+    report_wave,
+)
 from robcal.physics.gravity_sag import without_masses
-from robcal.physics.site import LETTER_OF_KIND, Joint, RobotSite, breaks, each_place, exponential_law
+from robcal.physics.site import LETTER_OF_KIND, Joint, RobotSite, breaks, each_place, exponential_law, waves
 from robcal.robot.terms import identifier
 
 BASE_MOVED = Kind(
@@ -103,18 +115,7 @@ def _wobble(site: RobotSite, joint: Joint) -> Iterator[RobotCause]:
     for angle in joint.cross_angles:
 
         def bases(c: Constants, kind: str = angle) -> tuple[Basis, ...]:
-            turn = f"order*q{joint.number}"
-            return (
-                Basis(joint.frame, kind, f"cos({turn})", "cosine", c),
-                Basis(joint.frame, kind, f"sin({turn})", "sine", c),
-            )
-
-        def report(v: Array, c: Constants) -> dict[str, object]:
-            return {
-                "order": int(c["order"]),
-                "amplitude_deg": float(np.hypot(*v)) * DEG,
-                "phase_deg": float(np.degrees(np.arctan2(v[1], v[0]))),
-            }
+            return waves(joint, kind, c["order"])
 
         yield RobotCause(
             AXIS_WOBBLE,
@@ -122,7 +123,7 @@ def _wobble(site: RobotSite, joint: Joint) -> Iterator[RobotCause]:
             LETTER_OF_KIND[angle],
             ("cosine", "sine"),
             (2e-4, 2e-4),
-            report,
+            report_wave,
             grid=({"order": 1.0}, {"order": 2.0}, {"order": 3.0}),
             bases=bases,
             covariates=(f"q{joint.number}",),
@@ -136,9 +137,7 @@ def _growth(site: RobotSite, joint: Joint) -> Iterator[RobotCause]:
         if abs(length) < 0.02:
             continue
         for name in site.temperatures():
-            first = float(site.variables[name][int(np.argmin(site.variables["index"]))])
-
-            law = f"{length!r}*({name} - {first!r})"
+            law = f"{length!r}*{site.warmed(name)}"
 
             def warm(c: Constants, axis: str = axis, law: str = law) -> tuple[Basis, ...]:
                 return (Basis(joint.frame, axis, law, "growth"),)
@@ -208,11 +207,7 @@ def _base(site: RobotSite) -> Iterator[RobotCause]:
         None,
         kinds,
         (1e-3, 1e-3, 1e-3, 5e-4, 5e-4, 5e-4),
-        lambda v, c: {
-            "pose": c["pose"],
-            "shift_mm": [float(x) * 1e3 for x in v[:3]],
-            "turn_deg": [float(x) * DEG for x in v[3:]],
-        },
+        report_move,
         grid=tuple({"pose": i} for i in first),
         ordered={"pose": every},
         bases=lambda c: tuple(Basis("base", kind, "step(index - pose + 0.5)", kind, c) for kind in kinds),

@@ -15,7 +15,7 @@ from robcal.calibration.identifiability import weak_parameters
 from robcal.calibration.identification import IdentifiedRobot
 from robcal.calibration.joint_log import JointLog
 from robcal.calibration.measurements import RobotObservations, RobotRecording, Rows, evenly_weighted
-from robcal.calibration.observations import DistanceObservations, FrameObservations
+from robcal.calibration.observations import DistanceObservations, FrameObservations, PointObservations
 from robcal.diagnosis.core.fitting import Accepted, fit
 from robcal.diagnosis.core.recording import Recording, observation_data
 from robcal.diagnosis.core.result import Diagnosis
@@ -32,6 +32,9 @@ from robcal.recipe.evidence import Evidence, evidence_of
 from robcal.recipe.identification import Identification
 from robcal.recipe.image_findings import ImageFindings
 from robcal.recipe.in_force import Form, InForce, choose
+from robcal.recipe.lack_of_fit import missing_joint_sigma
+from robcal.recipe.noise import noise_of
+from robcal.recipe.order import covariance_without_order, placed, without_order
 from robcal.recipe.recording import recording_for_diagnosis
 from robcal.robot.kernel_cache import kernel_of
 from robcal.transforms import Array, retract
@@ -40,13 +43,18 @@ MEASURING = ("camera", "wire", "sensor")
 """Stages whose causes displace what is measured; those of the body are judged by the frames already."""
 
 
-def corrected(recording: RobotRecording, log: JointLog, diagnosis: Diagnosis) -> RobotRecording | None:
+def corrected(
+    recording: RobotRecording, log: JointLog, diagnosis: Diagnosis, moves: bool = True
+) -> RobotRecording | None:
     """The recording without the displacements found in the measuring system; None where there are none.
 
+    ``moves`` : whether those that follow the order of the poses are still in it.
     Weakness: displaced targets of a body and exchanged ids are not corrected in frames.
     """
     found = [
-        (f, f.cause) for f in diagnosis.findings if isinstance(f.cause, ObservationCause) and f.cause.stage in MEASURING
+        (f, f.cause)
+        for f in diagnosis.findings
+        if isinstance(f.cause, ObservationCause) and f.cause.stage in MEASURING and (moves or not f.cause.of_order)
     ]
     if not found:
         return None
@@ -99,6 +107,8 @@ class RobotDiagnosis:
     robot : the robot in force.
     relative : (p, p) covariance of its parameters against frames of the own station; None without one.
     corrected : the measurements without the faults of the measuring system that the robot was fitted beside, if any.
+    placed : the measurements without what follows the order of the poses, which the robot speaks of; None where nothing
+        does.
     evidence : what every pose says of each cause.
     """
 
@@ -108,6 +118,7 @@ class RobotDiagnosis:
     robot: CalibratedRobot = field(repr=False)
     relative: Array | None = field(repr=False)
     corrected: RobotRecording | None = field(repr=False)
+    placed: RobotRecording | None = field(repr=False)
     evidence: Evidence = field(repr=False)
 
 
@@ -153,26 +164,30 @@ def diagnose_robot(
     if not in_force.diagnosed:
         used = robot.used[kept]  # poses that the identification left out
         clean, rows = clean.subset(used), rows[used]
-    delivered, relative = robot_in_force(found, log, clean, rows, in_force.form)
+    delivered, relative, put = robot_in_force(found, log, clean, rows, in_force.form)
+    if not in_force.diagnosed and not recording.own_station:
+        delivered = found.robot  # as it was identified, so that nothing is worse than without a diagnosis
+    delivered = with_lack_of_fit(delivered, found, log, clean, rows, in_force.form)
     return RobotDiagnosis(
         diagnosis=diagnosis,
         recording=recording,
         in_force=in_force,
         robot=delivered,
         relative=relative,
-        corrected=corrected(found.recording, log, diagnosis) if in_force.form.direct else None,
+        corrected=corrected(put or found.recording, log, diagnosis, put is None) if in_force.form.direct else None,
+        placed=put,
         evidence=evidence_of(robot.model, recording, free, verify, diagnosis),
     )
 
 
 def robot_in_force(
     found: Identification, log: JointLog, recording: Recording, rows: Rows, form: Form
-) -> tuple[CalibratedRobot, Array | None]:
+) -> tuple[CalibratedRobot, Array | None, RobotRecording | None]:
     """All parameters and terms of a model once more together, with base and tool in the datum of the measurements.
 
     A robot that is fitted beside the errors of its own station is better than one from its frames alone; what those
     errors displace all frames by is no part of the robot, so base and tool follow from the frames as they were measured
-    and as a table of poses states them.
+    and as a table of poses states them. Terms that follow the order of the poses stay with the recording.
 
     Parameters
     ----------
@@ -180,8 +195,8 @@ def robot_in_force(
 
     Returns
     -------
-    The robot, and (p, p) the covariance of its parameters where errors common to all poses are known, None where there
-    are none.
+    The robot; (p, p) the covariance of its parameters where errors common to all poses are known, None where there are
+    none; the measurements without what follows the order of the poses, None where nothing does.
     """
     noise = estimate_noise(form.model, recording, form.free, form.direct)
     final = form.fit(noise.apply(recording))
@@ -189,10 +204,15 @@ def robot_in_force(
     if recording.own_station and final.common is not None:
         known = fit(final.model, replace(noise.apply(recording), common=None), form.free, form.direct, iterations=0)
         relative = known.covariance[:p, :p] * final.variance_factor
+        _, relative = covariance_without_order(final.model, final.free, relative)
+    put = placed(found.recording, log, final)
+    names, covariance = covariance_without_order(
+        final.model, final.free, final.covariance[:p, :p] * final.variance_factor
+    )
     robot = CalibratedRobot(
-        model=with_folded_cell(final.model),
-        names=final.free,
-        covariance=final.covariance[:p, :p] * final.variance_factor,
+        model=with_folded_cell(without_order(final.model)),
+        names=names,
+        covariance=covariance,
         covariance_scale=noise.factor,
         joint_sigma=noise.joint_sigma,
         statics="converged",  # as the diagnosis fits
@@ -200,13 +220,36 @@ def robot_in_force(
     if recording.observations_are_spatial:
         joint = noise.joint_sigma / np.sqrt(noise.factor)
         stated = log.as_stated().inputs(robot.kernel).subset(rows)
-        measured = found.recording.select(rows)
+        measured = (put or found.recording).select(rows)
         if recording.own_station:
             joint = 0.0
             measured = tuple(evenly_weighted(o) if isinstance(o, FrameObservations) else o for o in measured)
         robot = replace(robot, model=with_fitted_cell(robot.kernel, stated, measured, joint))
     nominal = found.robot.nominal
-    return (robot if nominal is None else robot.with_recording(log, nominal)), relative
+    robot = robot if nominal is None else robot.with_recording(log, nominal)
+    return robot, relative, put
+
+
+def with_lack_of_fit(
+    robot: CalibratedRobot, found: Identification, log: JointLog, recording: Recording, rows: Rows, form: Form
+) -> CalibratedRobot:
+    """The robot with what poses kept out show beyond its parameters, beside what the measurement itself scatters by.
+
+    An own station's frames share errors that are told apart already.
+    """
+    if recording.own_station:
+        return robot
+    noise = estimate_noise(form.model, recording, form.free, form.direct)
+    parts = noise_of(found, robot, log)
+    scale = noise.factor
+    if parts.source != "none" and isinstance(recording.observations, FrameObservations | PointObservations):
+        said = np.trace(recording.observations.covariance[:, :3, :3], axis1=1, axis2=2)
+        scale = float(parts.measurement**2 / np.mean(said))
+    plain = replace(recording, common=None)
+    fitted = form.fit(noise.apply(plain))
+    inputs = log.as_stated().inputs(fitted.kernel).subset(rows)
+    joint = missing_joint_sigma(plain, fitted, inputs, scale)
+    return robot if joint is None else replace(robot, joint_sigma=joint.tolist(), covariance_scale=scale)
 
 
 def own_elasticities(found: IdentifiedRobot) -> tuple[str, ...]:

@@ -14,6 +14,7 @@ from robcal.calibration.observations import FrameObservations
 from robcal.calibration.verification import Verification, cross_validate, fit_nominal, repetitions, tool_errors, verify
 from robcal.errors import InvalidInput
 from robcal.recipe.identification import Identification
+from robcal.recipe.robot_diagnosis import RobotDiagnosis
 from robcal.robot.kernel import PoseInputs
 from robcal.robot.model import RobotModel
 from robcal.transforms import Array, difference
@@ -54,6 +55,7 @@ def verify_robot(
     options: IdentifyOptions | None = None,
     freed: RobotRecording | None = None,
     relative: Array | None = None,
+    placed: RobotRecording | None = None,
 ) -> RobotVerification:
     """Verify on the kept-out poses, or by folds where there are none.
 
@@ -62,17 +64,25 @@ def verify_robot(
     model : the nominal robot. robot : the one in force.
     freed : the measurements without what the diagnosis found in the measuring system.
     relative : covariance (p, p) of the robot's parameters against frames of the own station.
+    placed : the measurements in the frame that the robot speaks in, where the station or the base moved.
     """
     options = options or IdentifyOptions()
-    rows, recording = identification.sound, identification.recording
+    rows, recording = identification.sound, placed or identification.recording
     stated, inputs = robot.inputs(log.as_stated()), log.inputs(robot.kernel)
     kept_out, notes = well_measured(recording, identification.kept_out(log), log.names)
     if not len(kept_out):
         groups = repetitions(log.q[rows])
         folds = min(FOLDS, int(groups.max()) + 1)
         with_terms = model.with_terms(robot.model.terms)
+        expected = {f"{term.name}.{short}": size for term in robot.model.terms for short, size in term.priors.items()}
         outcome = cross_validate(
-            with_terms, inputs.subset(rows), recording.select(rows), options, folds=folds, groups=groups
+            with_terms,
+            inputs.subset(rows),
+            recording.select(rows),
+            replace(options, priors={**expected, **options.priors}),
+            folds=folds,
+            groups=groups,
+            stated=stated.subset(rows),
         )
         notes = [*notes, f"no verification poses: {folds}-fold cross-validation over groups of poses"]
         return RobotVerification(outcome, None, rows, tuple(notes))
@@ -80,8 +90,8 @@ def verify_robot(
     foreign = _foreign(recording, rows, kept_out)
     if foreign:
         # another measuring system has a world and a tool of its own, and nobody but these poses knows them
-        placed = with_fitted_cell(robot.kernel, stated.subset(kept_out), recording.select(kept_out), anew=True)
-        tested = replace(tested, model=placed)
+        at_home = with_fitted_cell(robot.kernel, stated.subset(kept_out), recording.select(kept_out), anew=True)
+        tested = replace(tested, model=at_home)
         notes = [*notes, f"{foreign} serve the verification alone: their world and tool are fitted to these very poses"]
         nominal = fit_nominal(model, stated.subset(kept_out), recording.select(kept_out))
     else:
@@ -96,19 +106,40 @@ def verify_robot(
     recorded, unstated = None, outcome if log.inferred else None
     if not foreign and (freed is not None or log.inferred):
         used = recording if freed is None else freed
-        placed = with_fitted_cell(robot.kernel, inputs.subset(rows), used.select(rows))
-        beside = replace(tested, model=placed)
+        at_home = with_fitted_cell(robot.kernel, inputs.subset(rows), used.select(rows))
+        beside = replace(tested, model=at_home)
         recorded = verify(beside, inputs.subset(kept_out), used.select(kept_out))
         if freed is not None:
             if log.inferred:
-                placed = with_fitted_cell(robot.kernel, stated.subset(rows), used.select(rows))
-                beside = replace(tested, model=placed)
+                at_home = with_fitted_cell(robot.kernel, stated.subset(rows), used.select(rows))
+                beside = replace(tested, model=at_home)
                 unstated = verify(beside, stated.subset(kept_out), used.select(kept_out))
             # the stated uncertainty is that of the robot; faults of the measuring are told apart
             judged = {name: getattr(recorded, name) for name in ("normalised", "degrees", "p_value", "coverage_95")}
             outcome = replace(outcome, **judged)
             notes = [*notes, "uncertainties are judged without the faults of the measuring system that were found"]
     return RobotVerification(outcome, recorded, kept_out, tuple(notes), unstated)
+
+
+def kept_out_gain(
+    model: RobotModel,
+    identification: Identification,
+    diagnosed: RobotDiagnosis,
+    log: JointLog,
+    options: IdentifyOptions | None = None,
+) -> tuple[float, RobotVerification]:
+    """What the identified robot misses (RMS, m) where the one in force is verified, and that verification.
+
+    Both against the same measurements, and both as any user would predict.
+    """
+    placed = diagnosed.placed
+    after = verify_robot(
+        model, identification, diagnosed.robot, log, options, diagnosed.corrected, diagnosed.relative, placed
+    )
+    if not diagnosed.in_force.diagnosed and not diagnosed.recording.own_station:
+        return after.delivered.tools["0"].rms, after
+    before = verify_robot(model, identification, identification.robot, log, options, placed=placed)
+    return before.delivered.tools["0"].rms, after
 
 
 def _foreign(recording: RobotRecording, rows: Rows, kept_out: Rows) -> str:
@@ -124,11 +155,13 @@ def _foreign(recording: RobotRecording, rows: Rows, kept_out: Rows) -> str:
     return " and ".join(foreign)
 
 
-def datum_note(identification: Identification, robot: CalibratedRobot, log: JointLog) -> str:
+def datum_note(
+    identification: Identification, robot: CalibratedRobot, log: JointLog, placed: RobotRecording | None = None
+) -> str:
     """Where measured frames and predictions at the identified poses do not agree in the mean; empty if they do."""
     rows = identification.sound
     T = robot.predict(robot.inputs(log.as_stated()).subset(rows))[0]
-    for o in identification.recording.select(rows):
+    for o in (placed or identification.recording).select(rows):
         if not isinstance(o, FrameObservations) or len(o.pose) < 3:
             continue
         off = difference(T[o.pose], o.world_T_tool)[:, :3]

@@ -5,7 +5,9 @@ measurements as they are. Errors come from blocked folds (Roberts et al., 2017):
 together, and so do repeats.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -19,6 +21,8 @@ from robcal.robot.model import GEOMETRIC_KINDS
 
 MUCH_WORSE = 1.25
 """Factor by which the error in one fold may grow."""
+PAYING_SIGMAS = 2.0
+"""Standard errors by which the error has to fall: over eight folds about 95 % of a one-sided test."""
 CLEAR, CLEAR_SIGMAS = 0.9, 3.0
 """Factor to which the error has to fall, and standard errors, for a fault of the measuring to be beyond doubt."""
 WEIGHTED_SIGMAS = 2.0
@@ -46,30 +50,74 @@ def delivered_errors(
     inputs : the poses as they would be stated to predict. labels : fold of each pose (n,).
     freed : whether the measurements count without the displacements that the fit holds for faults of the measuring.
     """
-    kernel = fitted.kernel
-    columns = np.array([kernel.index[name] for name in fitted.free], dtype=np.intp)
-    frames, J = kernel.frames_and_jacobian(fitted.theta, inputs, columns)
-    plain = replace(recording, common=None, shared=None)
-    residual, jacobian = plain.linearise(frames, J)
-    cell = [f"{end}.{kind}" for end in ("base", "tool") for kind in GEOMETRIC_KINDS]
-    own = [k for k, name in enumerate(fitted.free) if name in cell]
-    displaced = fitted.jacobian[:, len(columns) :]
-    direct = [item.values for item in fitted.accepted if isinstance(item.cause, ObservationCause)]
-    amplitudes = np.concatenate(direct) if direct else np.zeros(0)
-    fold_of_row = labels[fitted.row_pose]
-    left = np.empty(len(residual))
-    for fold in np.unique(labels):
-        test = fold_of_row == fold
-        rows = np.vstack([fitted.jacobian[~test], fitted.prior])
-        step = solve(rows, np.concatenate([fitted.residual[~test], fitted.prior_residual]))
-        after = residual - jacobian @ step[: len(columns)]
-        if freed:
-            after = after - displaced @ (amplitudes + step[len(columns) :])
-        # base and tool are those of the measurements as they are
-        left[test] = after[test] - jacobian[np.ix_(test, own)] @ solve(jacobian[np.ix_(~test, own)], after[~test])
-    errors = plain.unwhiten(left[:, None], frames)[:, :3, 0]
-    count = len(recording.observations.pose)
-    return np.linalg.norm(errors, axis=1), np.linalg.norm(left.reshape(count, -1), axis=1)
+    return Delivery(recording, fitted, inputs, labels, freed).errors()
+
+
+@dataclass(frozen=True)
+class Delivery:
+    """What a fitted robot delivers at poses of other folds: see :func:`delivered_errors`."""
+
+    recording: Recording
+    fitted: Fit
+    inputs: PoseInputs
+    labels: Array
+    freed: bool = False
+
+    @cached_property
+    def _stated(self) -> tuple[Array, Array, Array]:
+        """Frames, whitened residuals and Jacobian at the poses as they are stated."""
+        kernel = self.fitted.kernel
+        columns = np.array([kernel.index[name] for name in self.fitted.free], dtype=np.intp)
+        frames, J = kernel.frames_and_jacobian(self.fitted.theta, self.inputs, columns)
+        residual, jacobian = replace(self.recording, common=None, shared=None).linearise(frames, J)
+        return frames, residual, jacobian
+
+    @cached_property
+    def _compressed(self) -> dict[int, Array]:
+        """By fold, the triangular factor of Jacobian and residual of all others: every subset of columns has its least
+        squares solution in it."""
+        fold_of_row = self.labels[self.fitted.row_pose]
+        rows = np.column_stack([self.fitted.jacobian, self.fitted.residual])
+        return {int(k): np.asarray(np.linalg.qr(rows[fold_of_row != k], mode="r")) for k in np.unique(self.labels)}
+
+    def vectors(self, dropped: Sequence[str] = ()) -> tuple[Array, Array]:
+        """Errors (m_obs, k), m and rad, and whitened ones; without the amplitudes ``dropped``, to first order."""
+        fitted, labels = self.fitted, self.labels
+        frames, residual, jacobian = self._stated
+        count = len(fitted.free)
+        out = np.isin(np.array(fitted.free), list(dropped))
+        value = fitted.theta[[fitted.kernel.index[name] for name in fitted.free]] * out
+        # a term is left out by an amplitude of zero: in small effects the fit is linear
+        residual = residual + jacobian @ value
+        stay = np.concatenate([~out, np.ones(fitted.jacobian.shape[1] - count, dtype=bool)])
+        kept = ~np.any(fitted.prior[:, :count][:, out] != 0.0, axis=1)
+        prior, expected = fitted.prior[kept][:, stay], fitted.prior_residual[kept]
+        jacobian = jacobian[:, ~out]
+        cell = [f"{end}.{kind}" for end in ("base", "tool") for kind in GEOMETRIC_KINDS]
+        own = [k for k, name in enumerate(np.array(fitted.free)[~out]) if name in cell]
+        displaced = fitted.jacobian[:, count:]
+        direct = [item.values for item in fitted.accepted if isinstance(item.cause, ObservationCause)]
+        amplitudes = np.concatenate(direct) if direct else np.zeros(0)
+        fold_of_row = labels[fitted.row_pose]
+        left = np.empty(len(residual))
+        for fold in np.unique(labels):
+            test = fold_of_row == fold
+            rows = self._compressed[int(fold)]
+            at_fit = rows[:, -1] + rows[:, :count] @ value
+            step = solve(np.vstack([rows[:, :-1][:, stay], prior]), np.concatenate([at_fit, expected]))
+            after = residual - jacobian @ step[: jacobian.shape[1]]
+            if self.freed:
+                after = after - displaced @ (amplitudes + step[jacobian.shape[1] :])
+            # base and tool are those of the measurements as they are
+            left[test] = after[test] - jacobian[np.ix_(test, own)] @ solve(jacobian[np.ix_(~test, own)], after[~test])
+        plain = replace(self.recording, common=None, shared=None)
+        per = len(left) // len(self.recording.observations.pose)
+        return plain.unwhiten(left[:, None], frames)[:, :, 0], left.reshape(-1, per)
+
+    def errors(self, dropped: Sequence[str] = ()) -> tuple[Array, Array]:
+        """Lengths (m_obs,) of the position errors, m, and of the whitened ones."""
+        errors, white = self.vectors(dropped)
+        return np.linalg.norm(errors[:, :3], axis=1), np.linalg.norm(white, axis=1)
 
 
 @dataclass(frozen=True)
@@ -84,8 +132,8 @@ class Gain:
 
     @property
     def pays(self) -> bool:
-        """The error falls by more than its own standard error, and in no fold it grows much."""
-        return self.before - self.after > self.sigma and self.even
+        """The error falls by clearly more than its own standard error, and in no fold it grows much."""
+        return self.before - self.after > PAYING_SIGMAS * self.sigma and self.even
 
     def pays_beside(self, weighted: "Gain") -> bool:
         """The error falls, or that weighted by its uncertainty does beyond doubt while this one stays as it is.
