@@ -73,7 +73,10 @@ def work(context: Context) -> Outcome:
     datum = "" if instruments is not None else datum_note(identification, calibrated, poses, placed)
     notes = [*found.notes, *_approach_note(found), *filter(None, [datum])]
     if placed is not None:
-        notes.append("errors are against the measurements in the frame of the first pose, the moves found taken back")
+        notes.append(
+            "station or base moved during the recording: the robot speaks in the frame of the first pose; errors are "
+            "against the measurements as they are, those as recorded with the moves taken back"
+        )
     diagnosis = read_json(run.diagnosis) if diagnosed and run.diagnosis.is_file() else None
     judged = verdict(
         robot_facts(identification, calibrated, poses, found.delivered, diagnosis, doubtful_coordinates(run))

@@ -10,10 +10,15 @@ from robcal.calibration.measurements import Rows
 from robcal.diagnosis.core.fitting import Accepted, Fit, fit
 from robcal.diagnosis.core.recording import Recording
 from robcal.diagnosis.gain.delivered import WAITING, Delivery, Gain, blocked_folds, gain_of
+from robcal.physics.cause import ObservationCause
 from robcal.robot.model import RobotModel
 from robcal.transforms import Array
 
 Groups = Mapping[str, tuple[str, ...]]
+
+MOVED_SHARE = 0.5
+"""Moves of the station are taken back where at most this share of the error stays: else the robot would speak in a
+frame that only some of the poses vouch for."""
 
 
 @dataclass(frozen=True)
@@ -87,8 +92,16 @@ def choose(recording: Recording, log: JointLog, rows: Rows, bare: Form, extended
     if extended.direct:
         beside = replace(bare, direct=extended.direct)
         found, _ = gain(bare, beside, stated, True)
-        chosen = beside if found.clear else bare
-        reasons.append(_told("faults of the measuring", found, found.clear, found))
+        if any(_is_move(item) for item in extended.direct) and found.after > MOVED_SHARE * found.before:
+            reasons.append(
+                "moves of the station are not taken back, as they explain less than half: "
+                f"{1e3 * found.before:.3g} mm without, {1e3 * found.after:.3g} mm with them"
+            )
+            beside = replace(bare, direct=tuple(item for item in extended.direct if not _is_move(item)))
+            found, _ = gain(bare, beside, stated, True)
+        chosen = beside if beside.direct and found.clear else bare
+        if beside.direct:
+            reasons.append(_told("faults of the measuring", found, found.clear, found))
     if groups := groups_of(bare, extended):
         full = replace(extended, direct=chosen.direct)
         pays = False
@@ -115,6 +128,10 @@ def choose(recording: Recording, log: JointLog, rows: Rows, bare: Form, extended
     whole, _ = gain(bare, chosen, stated, False)
     reason = "; ".join(reasons) + ("" if chosen is not bare else "; the identified robot is delivered")
     return InForce(chosen, chosen is not bare, whole.before, whole.after, reason, dropped)
+
+
+def _is_move(item: Accepted) -> bool:
+    return isinstance(item.cause, ObservationCause) and item.cause.of_order
 
 
 def groups_of(bare: Form, extended: Form) -> Groups:

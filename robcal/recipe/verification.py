@@ -67,7 +67,9 @@ def verify_robot(
     placed : the measurements in the frame that the robot speaks in, where the station or the base moved.
     """
     options = options or IdentifyOptions()
-    rows, recording = identification.sound, placed or identification.recording
+    rows, recording = identification.sound, identification.recording
+    # only the recording knows that station or base moved, and when
+    freed = freed if freed is not None else placed
     stated, inputs = robot.inputs(log.as_stated()), log.inputs(robot.kernel)
     kept_out, notes = well_measured(recording, identification.kept_out(log), log.names)
     if not len(kept_out):

@@ -98,7 +98,7 @@ def test_a_log_of_another_recording_is_refused(frame_campaign: Path, tmp_path: P
             row.update({name: rows[0][name] for name in JOINTS[1:]})
 
     edit_rows(frame_campaign / "poses.csv", only_the_first_joint)
-    with pytest.raises(InvalidInput, match=r"even the identified robot misses .* no single slip"):
+    with pytest.raises(InvalidInput, match=r"even the identified robot misses .* no single fault"):
         run_campaign(frame_campaign, tmp_path / "run", until="identify")
 
 
