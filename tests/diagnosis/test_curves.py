@@ -148,6 +148,7 @@ def test_diagnosis_models_the_curves(uneven: tuple[Recording, Fit, np.ndarray]) 
     assert "turned by" in " ".join(f.statement for f in curves)
 
 
+@pytest.mark.slow
 def test_predicted_covariance_holds_at_poses_kept_out(uneven: tuple[Recording, Fit, np.ndarray]) -> None:
     """Joints that scatter and curves that are known only where the joints were: errors have the reported size."""
     s = scenario(3, n=400)

@@ -181,6 +181,10 @@ def test_locked_gone_or_foreign_states_are_told(made: Path, state: Path, tmp_pat
     assert "there is no such state" in refused("add", tmp_path / "none.drift", made / "c01.csv")
     (tmp_path / "text.drift").write_text("no database " * 100)
     assert "no state of a drift control" in refused("status", tmp_path / "text.drift")
+
+
+def test_a_server_that_does_not_answer_is_told() -> None:
+    pytest.importorskip("psycopg")
     assert "does not answer" in refused("status", "postgresql://nobody@127.0.0.1:1/none")
 
 
