@@ -158,7 +158,10 @@ def transaction(place: Path | str, *, make: bool = False) -> Iterator[sa.Connect
             yield connection
     except exc.NoSuchModuleError:
         raise InvalidInput(f"{name}: databases are SQLite files or postgresql://user@host/name") from None
-    except (exc.ArgumentError, ModuleNotFoundError) as error:
+    except ModuleNotFoundError as error:
+        remedy = "install robcal[postgresql], or name a file"
+        raise InvalidInput(f"{name}: the driver of this database is not installed ({error.name}): {remedy}") from None
+    except exc.ArgumentError as error:
         raise InvalidInput(f"{name}: cannot be used as a database: {error}") from None
     except exc.DBAPIError as error:
         raise StorageError(f"{name}: {_remedy(str(error.orig))}") from None

@@ -188,6 +188,11 @@ def test_a_server_that_does_not_answer_is_told() -> None:
     assert "does not answer" in refused("status", "postgresql://nobody@127.0.0.1:1/none")
 
 
+def test_a_driver_that_is_not_installed_is_told(monkeypatch: Any) -> None:
+    monkeypatch.setitem(sys.modules, "psycopg", None)
+    assert "install robcal[postgresql]" in refused("status", "postgresql://nobody@127.0.0.1:1/none")
+
+
 def test_full_disk_is_told_and_takes_nothing_in(made: Path, state: Path) -> None:
     import sqlalchemy as sa
 

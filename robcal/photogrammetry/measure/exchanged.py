@@ -30,22 +30,25 @@ def find_exchanges(points: MeasuredPoints, body: Body) -> tuple[Exchange, ...]:
     at = body.index(points.target)
     usable = (at >= 0) & body.known[at]
     found: dict[tuple[int, int], list[tuple[int, float, float]]] = defaultdict(list)
-    together: dict[tuple[int, int], int] = defaultdict(int)
     for pose in np.unique(points.pose[usable]):
         rows = np.flatnonzero(usable & (points.pose == pose))
-        if len(rows) < FEWEST_TARGETS or len(np.unique(at[rows])) < len(rows):
+        if len(rows) < FEWEST_TARGETS:
             continue
         for i, j, before, after in _in_pose(points.p_world[rows], body.points[at[rows]]):
             a, b = sorted((int(points.target[rows[i]]), int(points.target[rows[j]])))
             found[a, b].append((int(pose), before, after))
-    for a, b in found:
-        poses = [set(points.pose[usable & (points.target == t)].tolist()) for t in (a, b)]
-        together[a, b] = len(poses[0] & poses[1])
-    return tuple(
-        Exchange(pair, tuple(p for p, _, _ in hits), *(float(np.median(v)) for v in list(zip(*hits, strict=True))[1:]))
-        for pair, hits in sorted(found.items())
-        if 2 * len(hits) < together[pair]
-    )
+
+    def shown(pair: tuple[int, int]) -> int:
+        """Number of poses that show both targets."""
+        poses = [points.pose[usable & (points.target == t)] for t in pair]
+        return len(np.intersect1d(*poses))
+
+    exchanges = []
+    for pair, hits in sorted(found.items()):
+        poses, before, after = zip(*hits, strict=True)
+        if 2 * len(poses) < shown(pair):
+            exchanges.append(Exchange(pair, poses, float(np.median(before)), float(np.median(after))))
+    return tuple(exchanges)
 
 
 def exchanged_back(points: MeasuredPoints, exchanges: tuple[Exchange, ...]) -> MeasuredPoints:
