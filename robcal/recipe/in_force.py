@@ -157,8 +157,7 @@ def not_paying(full: Delivery, groups: Groups, fold: Array) -> tuple[str, ...]:
         for name, names in left.items():
             without = full.errors((*dropped, *names))
             found, weighted = (gain_of(b, a, fold) for b, a in zip(without, errors, strict=True))
-            loss = (found.after - found.before) / max(found.sigma, 1e-12)
-            trials[name] = (loss, found.pays_beside(weighted), (*dropped, *names), without)
+            trials[name] = (-found.strength, found.pays_beside(weighted), (*dropped, *names), without)
         useless = {name: trial for name, trial in trials.items() if not trial[1]}
         if not useless:
             break

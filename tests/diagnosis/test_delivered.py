@@ -24,6 +24,21 @@ def test_chance_does_not_pay_more_often_than_chance_does() -> None:
     assert np.mean(pays) < 0.25
 
 
+def test_a_pose_of_great_leverage_does_not_hide_what_all_others_gain() -> None:
+    before = errors(1e-4, 3)
+    after = 0.5 * before
+    before[-1], after[-1] = 150e-4, 12e-4
+    found = gain_of(before, after, FOLD)
+    assert found.before - found.after < 2.0 * found.sigma
+    assert found.pays
+
+
+def test_a_pose_of_great_leverage_alone_does_not_pay() -> None:
+    before, after = errors(1e-4, 5), errors(1e-4, 6)
+    before[-1], after[-1] = 150e-4, 12e-4
+    assert not gain_of(before, after, FOLD).pays
+
+
 def test_a_gain_bought_in_one_part_does_not_pay() -> None:
     before = errors(1e-4, 3)
     after = np.where(FOLD == 2, 1.5 * before, 0.7 * before)

@@ -22,11 +22,9 @@ from robcal.robot.model import GEOMETRIC_KINDS
 MUCH_WORSE = 1.25
 """Factor by which the error in one fold may grow."""
 PAYING_SIGMAS = 2.0
-"""Standard errors by which the error has to fall: over eight folds about 95 % of a one-sided test."""
+"""Standard errors that the gain of the folds has to reach: over eight folds about 95 % of a one-sided test."""
 CLEAR, CLEAR_SIGMAS = 0.9, 3.0
 """Factor to which the error has to fall, and standard errors, for a fault of the measuring to be beyond doubt."""
-WEIGHTED_SIGMAS = 2.0
-"""Standard errors by which the weighted error has to fall where the plain one does not."""
 WAITING = 1.01
 """Factor by which the error may grow where terms wait for approach directions that the user may state."""
 
@@ -131,17 +129,25 @@ class Gain:
     folds_after: Array
 
     @property
+    def strength(self) -> float:
+        """Mean of the folds' gains by its standard error; the gain of a fold is the logarithm of the factor by which
+        its error falls, so that one pose of great leverage does not drown what all others say."""
+        tiny = np.finfo(float).tiny
+        gains = np.log(np.maximum(self.folds_before, tiny)) - np.log(np.maximum(self.folds_after, tiny))
+        error = np.std(gains, ddof=1) / np.sqrt(len(gains)) if len(gains) > 1 else np.inf
+        return float(np.mean(gains) / max(error, 1e-12))
+
+    @property
     def pays(self) -> bool:
-        """The error falls by clearly more than its own standard error, and in no fold it grows much."""
-        return self.before - self.after > PAYING_SIGMAS * self.sigma and self.even
+        """The error falls, in the folds by clearly more than their standard error, and in none it grows much."""
+        return self.after < self.before and self.strength > PAYING_SIGMAS and self.even
 
     def pays_beside(self, weighted: "Gain") -> bool:
         """The error falls, or that weighted by its uncertainty does beyond doubt while this one stays as it is.
 
         Directions and places that are measured best show small effects which the plain length hides in noise.
         """
-        falls = weighted.before - weighted.after > WEIGHTED_SIGMAS * weighted.sigma and weighted.even
-        return self.pays or (falls and self.even and self.after <= WAITING * self.before)
+        return self.pays or (weighted.pays and self.even and self.after <= WAITING * self.before)
 
     @property
     def clear(self) -> bool:

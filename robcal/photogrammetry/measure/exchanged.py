@@ -45,9 +45,9 @@ def find_exchanges(points: MeasuredPoints, body: Body) -> tuple[Exchange, ...]:
 
     exchanges = []
     for pair, hits in sorted(found.items()):
-        poses, before, after = zip(*hits, strict=True)
+        poses = tuple(pose for pose, _, _ in hits)
         if 2 * len(poses) < shown(pair):
-            exchanges.append(Exchange(pair, poses, float(np.median(before)), float(np.median(after))))
+            exchanges.append(Exchange(pair, poses, *(float(np.median([hit[k] for hit in hits])) for k in (1, 2))))
     return tuple(exchanges)
 
 
