@@ -31,11 +31,19 @@ class TargetEntry(Entry):
     normal: Triple | None = None
 
 
+class ShapeEntry(Entry):
+    """The surface that carries the targets."""
+
+    kind: Literal["sphere"]
+    radius_mm: Positive
+
+
 class BodyEntry(Entry):
     """The whole file."""
 
     format: Literal["robcal/body-1"]
     targets: list[TargetEntry]
+    shape: ShapeEntry | None = None
     polarity: Literal["bright", "dark"] = "bright"
 
 
@@ -54,11 +62,12 @@ class BodyTargetRow:
 
 @dataclass(frozen=True)
 class BodyFile:
-    """Content of a body file."""
+    """Content of a body file; ``radius`` (m) of a sphere, None of any other body."""
 
     path: Path
     targets: tuple[BodyTargetRow, ...]
     polarity: str
+    radius: float | None = None
 
     def known(self) -> tuple[BodyTargetRow, ...]:
         """Targets with id and coordinates."""
@@ -117,7 +126,8 @@ def read_body(path: Path | str) -> BodyFile:
         )
     if not rows:
         raise InvalidInput(f"{document.path}: lists no targets: a body needs at least three")
-    return BodyFile(document.path, tuple(rows), entry.polarity)
+    radius = None if entry.shape is None else entry.shape.radius_mm / 1000
+    return BodyFile(document.path, tuple(rows), entry.polarity, radius)
 
 
 def _metres(values: Sequence[float]) -> tuple[float, float, float]:
