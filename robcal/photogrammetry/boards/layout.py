@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
 from robcal.errors import InvalidInput
 from robcal.imaging.aruco_markers import dictionary_by_name
@@ -217,5 +218,5 @@ def _grid(rows: int, columns: int) -> tuple[IntArray, IntArray]:
     return row, column
 
 
-def _flat(xy: Array) -> Array:
+def _flat(xy: NDArray[np.floating]) -> Array:
     return np.column_stack([xy, np.zeros(len(xy))]).astype(float)
