@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from robcal.photogrammetry.core.bodies import Body, IntArray, spans_plane
 from robcal.photogrammetry.core.camera import Camera, normalise, project
 from robcal.photogrammetry.orientation.p3p import three_point_poses
-from robcal.photogrammetry.orientation.resection import refine_poses
+from robcal.photogrammetry.orientation.resection import TargetMarks, refine_poses
 from robcal.transforms import Array, transform
 
 _CHANCE = 1e-3
@@ -242,17 +242,8 @@ def _verify(
         which = np.repeat(np.arange(len(matches)), [len(r) for _, r in matches])
         targets = candidates[np.concatenate([t for t, _ in matches])]
         rows = np.concatenate([r for _, r in matches])
-        fit = refine_poses(
-            poses[list(unique.values())],
-            which,
-            np.zeros(len(rows), dtype=np.int64),
-            [camera],
-            np.eye(4)[None],
-            body.points[targets],
-            xy[rows],
-            C[rows],
-            iterations=10,
-        )
+        marks = TargetMarks(body.points[targets], xy[rows], C[rows])
+        fit = refine_poses(poses[list(unique.values())], which, marks, camera, iterations=10)
         poses, cost = fit.reference_T_body, fit.cost
     found: list[Found] = []
     why = "no arrangement of the dots fits the body"

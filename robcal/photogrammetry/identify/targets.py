@@ -13,7 +13,7 @@ from robcal.photogrammetry.identify.extension import IdentifiedImage, Prediction
 from robcal.photogrammetry.identify.grid import has_rows, search_grid
 from robcal.photogrammetry.identify.grow import View, view_of
 from robcal.photogrammetry.identify.search import search_body
-from robcal.photogrammetry.orientation.resection import Resection, refine_poses, resect_images
+from robcal.photogrammetry.orientation.resection import Resection, TargetMarks, refine_poses, resect_images
 
 _CROWD = 100
 """Dots in an image above which triples of dots are tried but briefly: they would not be enough in any time."""
@@ -107,7 +107,7 @@ def _resected(
     ids = np.concatenate([coded[k][1][placed[k]] for k in several])
     xy = np.concatenate([images[k].xy[own] for k, own in zip(several, rows, strict=True)])
     covariance = np.concatenate([images[k].covariance[own] for k, own in zip(several, rows, strict=True)])
-    found = resect_images(camera, number, ids, xy, covariance, body, model_error_px=model_error_px)
+    found = resect_images(camera, number, ids, xy, covariance + model_error_px**2 * np.eye(2), body)
     return {
         k: replace(fit, inliers=fit.inliers[number == i])
         for i, (k, fit) in enumerate(zip(several, found, strict=True))
@@ -208,19 +208,10 @@ def _from_rows(
         return IdentifiedImage(none, none, None, "none", poses, _symmetric(len(found)) if found else why)
     best = found[0]
     rows, targets = dots[best.dots], candidates[best.targets]
-    zero = np.zeros(len(rows), dtype=np.int64)
     covariance = detections.covariance[rows] + best.rms**2 * np.eye(2)
     # the pose that belongs to the camera as given, not to the lens adjusted on the way
-    fit = refine_poses(
-        best.camera_T_body[None],
-        zero,
-        zero,
-        [camera],
-        np.eye(4)[None],
-        body.points[targets],
-        detections.xy[rows],
-        covariance,
-    )
+    marks = TargetMarks(body.points[targets], detections.xy[rows], covariance)
+    fit = refine_poses(best.camera_T_body[None], np.zeros(len(rows), dtype=np.int64), marks, camera)
     view = view_of(best, body.points[candidates])
     return IdentifiedImage(rows, body.ids[targets], fit.reference_T_body[0], "rows", view=view)
 
