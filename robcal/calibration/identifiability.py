@@ -68,7 +68,7 @@ class Candidates:
 
 
 def choose_candidates(model: RobotModel, parameters: str | Sequence[str]) -> Candidates:
-    """Candidates of a choice 'standard', 'geometry', 'table5.4', or of named parameters.
+    """Candidates of a choice 'standard', 'geometry', 'table5.4', 'none' (the robot stays as it is), or of named ones.
 
     Base and tool are always among them. Order of preference within the geometry: base, tool, the joints' zero offsets,
     then frame by frame from the base; so what remains ambiguous is reported in terms of the outer frames.
@@ -85,6 +85,8 @@ def choose_candidates(model: RobotModel, parameters: str | Sequence[str]) -> Can
     cross = [f"{f.name}.{k}" for f in model.frames for k in ELASTIC_KINDS if f"{f.name}.{k}" not in own]
     if parameters == "standard":
         return Candidates((*ends, *zeros, *others, *terms), tuple(own), tuple(cross))
+    if parameters == "none":
+        return Candidates(tuple(ends))
     if parameters == "geometry":
         return Candidates((*ends, *zeros, *others, *terms))
     if parameters == "table5.4":
@@ -95,7 +97,9 @@ def choose_candidates(model: RobotModel, parameters: str | Sequence[str]) -> Can
         table = [f"{f.name}.{k}" for f, kinds in zip(model.joints, TABLE_5_4, strict=True) for k in kinds]
         return Candidates((*ends, *table, *terms))
     if isinstance(parameters, str):
-        raise InvalidInput(f"parameters must be standard, geometry, table5.4 or a list of names, not '{parameters}'")
+        raise InvalidInput(
+            f"parameters must be standard, geometry, table5.4, none or a list of names, not '{parameters}'"
+        )
     return Candidates(tuple(dict.fromkeys((*ends, *parameters, *terms))))
 
 
