@@ -34,6 +34,8 @@ def look_into_images(campaign: Campaign) -> Looked:
         campaign = replace(campaign, entry=campaign.entry.model_copy(update={"station": None}))
     for source, (images, body, survey) in sources(campaign).items():
         faults += _headers(images)
+        if body.board is not None:
+            continue  # found by its own detector
         wrong, doubtful = _look(source, images, body, survey)
         faults += wrong
         doubts += doubtful
@@ -101,7 +103,7 @@ def _sizes(images: ImageSource, sizes: dict[tuple[int, int], Path]) -> list[str]
 
 def _codes(folder: Path, seen: Counter[int], looked: int, body: BodyFile, survey: SurveyEntry | None) -> Looked:
     """Codes read against those listed: both lists where they do not fit."""
-    listed = {t.id for t in body.targets if t.code not in (None, "corner") and t.id is not None}
+    listed = {t.id for t in body.targets if t.code not in (None, "corner", "circle") and t.id is not None}
     if not listed:
         return [], []
     lengths = [*(survey.scale_bars if survey else ()), *(survey.check_lengths if survey else ())]

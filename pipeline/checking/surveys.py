@@ -45,7 +45,7 @@ def _survey(where: str, body: BodySource, source: ImageSource, entry: SurveyEntr
             f"{where}: nothing gives the scale: photograph a scale bar and list it under scale_bars, or give the "
             "coordinates (xyz_mm) of two targets"
         )
-    elif not entry.scale_bars:
+    elif not entry.scale_bars and body.file.board is None:
         doubts.append(
             f"{where}: no scale_bars: the scale will be that of the {len(given)} coordinates given in the file"
         )
