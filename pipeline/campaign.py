@@ -233,7 +233,9 @@ class _Reader:
                 self._check_instrument(name, use, table, bodies)
         known = {n: (e.world_T_base, e.flange_T_tool) for n, e in entry.instruments.items()}
         try:
-            worlds, tools = cell_frames(list(tables), known, (entry.world_T_base, entry.flange_T_tool), entry)
+            alone = (entry.world_T_base, entry.flange_T_tool)
+            hands = [n for n, some in tables.items() if some and all(t.kind == "sensor_points" for t in some)]
+            worlds, tools = cell_frames(list(tables), known, alone, entry, hands)
         except InvalidInput as error:
             raise self._error(("instruments",), str(error)) from None
         return {

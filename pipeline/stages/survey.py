@@ -36,7 +36,7 @@ def work(context: Context) -> Outcome:
         done = survey_one(campaign, run, name, source)
         body = surveyed_body(name, source.file, done, _not_on_it(campaign, run, name, source))
         outputs += [run.save(artifacts.survey(name), done), run.save(artifacts.surveyed_body(name), body)]
-        outputs += _write(run, name, source.survey, body, done)
+        outputs += _write(run, name, source, body, done)
         notes += [f"survey of '{name}': {note}" for note in _notes(done)]
         doubts = _against_given(campaign, source, done)
         notes += doubts.told(name)
@@ -223,20 +223,11 @@ def surveyed_body(name: str, file: BodyFile, done: SurveyResult, beside: frozens
     )
 
 
-def _write(run: Run, name: str, source: ImageSource, body: Body, done: SurveyResult) -> list[Any]:
-    write_body(
-        run.body(name),
-        [int(i) for i in body.ids],
-        body.points,
-        body.covariance,
-        codes=body.codes,
-        diameters=[None if not np.isfinite(d) else float(d) for d in body.diameters],
-        polarity=body.polarity,
-        normals=body.normals,
-        comment=f"surveyed: {done.frame}; {done.scale}",
-    )
+def _write(run: Run, name: str, source: BodySource, body: Body, done: SurveyResult) -> list[Any]:
+    write_body(run.body(name), body, f"surveyed: {done.frame}; {done.scale}", source.file.board)
     sigma = np.sqrt(np.clip(np.diag(done.network.intrinsics_covariance), 0, None))
-    pixel = source.start.pixel_um if source.start is not None else None
+    start = source.survey.start if source.survey is not None else None
+    pixel = start.pixel_um if start is not None else None
     run.colmap(name).mkdir(parents=True, exist_ok=True)
     export_colmap(done.network, run.colmap(name))
     camera = CameraFile(done.network.camera, None, pixel, dict(zip(INTRINSIC_NAMES, map(float, sigma), strict=True)))

@@ -72,7 +72,7 @@ def read_poses(path: Path, robot: RobotModel | None, payloads: Collection[str], 
     q = np.column_stack([table.numbers(name) * factor for name, factor in joints])
     notes: list[str] = []
     approach, inferred = _approach(table, q, to_predict, notes)
-    known = {"pose", "payload", "set", *(name for name, _ in joints)}
+    known = {"pose", "payload", "set", "target", "turn_deg", *(name for name, _ in joints)}
     known |= {f"approach{k}" for k in range(1, q.shape[1] + 1)}
     return Poses(
         path=path,
