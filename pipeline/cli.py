@@ -164,27 +164,15 @@ def compensate(
     if program not in (None, "krl", "rapid", "urscript"):
         wrong_use(f"--program is 'krl', 'rapid' or 'urscript', not '{program}'")
     with answers("compensate", as_json, quiet) as answer:
-        from pipeline.prediction import compensate_run
+        from pipeline.prediction import CompensateOptions, compensate_run
 
-        targets, in_base = kind == "frames", system == "base"
-        answer.update(
-            compensate_run(
-                run_folder,
-                frames,
-                out,
-                as_frames=targets,
-                in_base=in_base,
-                skip_unreachable=skip,
-                program=program,
-                instrument=instrument,
-                at_cycle=at_cycle,
-            )
-        )
+        options = CompensateOptions(kind == "frames", system == "base", skip, program, instrument, at_cycle)
+        answer.update(compensate_run(run_folder, frames, out, options))
         for sentence in answer["warnings"]:
             LOG.warning(sentence)
         remaining = answer["remaining_max_mm"]
-        told = f"at most {remaining:.2g} mm" if remaining >= 1e-4 else "below 0.0001 mm"
-        LOG.info(f"{answer['frames']} rows in {out}, remaining error {told}")
+        size = f"at most {remaining:.2g} mm" if remaining >= 1e-4 else "below 0.0001 mm"
+        LOG.info(f"{answer['frames']} rows in {out}, remaining error {size}")
 
 
 @app.command()

@@ -224,18 +224,7 @@ def surveyed_body(name: str, file: BodyFile, done: SurveyResult, beside: frozens
 
 
 def _write(run: Run, name: str, source: BodySource, body: Body, done: SurveyResult) -> list[Any]:
-    write_body(
-        run.body(name),
-        [int(i) for i in body.ids],
-        body.points,
-        body.covariance,
-        codes=body.codes,
-        diameters=[None if not np.isfinite(d) else float(d) for d in body.diameters],
-        polarity=body.polarity,
-        normals=body.normals,
-        board=source.file.board,
-        comment=f"surveyed: {done.frame}; {done.scale}",
-    )
+    write_body(run.body(name), body, f"surveyed: {done.frame}; {done.scale}", source.file.board)
     sigma = np.sqrt(np.clip(np.diag(done.network.intrinsics_covariance), 0, None))
     start = source.survey.start if source.survey is not None else None
     pixel = start.pixel_um if start is not None else None

@@ -14,7 +14,6 @@ from robcal.files.yaml_io import FlowMapping, YamlDocument, yaml_text
 from robcal.imaging.ring_code import canonical_id, is_id
 from robcal.photogrammetry.boards.layout import Board, BoardKind
 from robcal.photogrammetry.core.bodies import Body
-from robcal.transforms import Array
 
 FORMAT = "robcal/body-1"
 CODES = ("ring12", "corner", "circle")
@@ -215,41 +214,30 @@ def check_ring_codes(body: BodyFile) -> None:
             )
 
 
-def write_body(
-    path: Path | str,
-    ids: Sequence[int],
-    points: Array,
-    covariance: Array | None,
-    *,
-    codes: Sequence[str | None] | None = None,
-    diameters: Sequence[float | None] | None = None,
-    polarity: str = "bright",
-    normals: Array | None = None,
-    board: Board | None = None,
-    comment: str = "",
-) -> None:
-    """Write a body with coordinates (n, 3) in m and their covariance (3n, 3n) atomically.
+def write_body(path: Path | str, body: Body, comment: str = "", board: Board | None = None) -> None:
+    """Write a body with its coordinates atomically.
 
     ``sigma_mm`` is written for x, y and z apart; the full covariance has its place in the stage's cache. Coordinates of
     a ``board`` stand beside its layout.
     """
-    sigma = None if covariance is None else np.sqrt(np.clip(np.diag(covariance), 0, None)).reshape(-1, 3) * 1000
+    sigma = None
+    if body.covariance is not None:
+        sigma = np.sqrt(np.clip(np.diag(body.covariance), 0, None)).reshape(-1, 3) * 1000
     targets = []
-    for i, number in enumerate(ids):
-        row: dict[str, Any] = FlowMapping(id=int(number), code=codes[i] if codes and board is None else None)
-        diameter = diameters[i] if diameters else None
-        known = diameter is not None and np.isfinite(diameter)
-        row["diameter_mm"] = round(float(diameter) * 1000, 9) if diameter is not None and known else None
-        row["xyz_mm"] = [round(float(v), 9) for v in np.asarray(points[i]) * 1000]
+    for i, number in enumerate(body.ids):
+        row: dict[str, Any] = FlowMapping(id=int(number), code=body.codes[i] if board is None else None)
+        diameter = body.diameters[i]
+        row["diameter_mm"] = round(float(diameter) * 1000, 9) if np.isfinite(diameter) else None
+        row["xyz_mm"] = [round(float(v), 9) for v in body.points[i] * 1000]
         row["sigma_mm"] = None if sigma is None else [float(f"{v:.4g}") for v in sigma[i]]
-        if normals is not None and np.isfinite(normals[i]).all():
-            row["normal"] = [round(float(v), 6) for v in normals[i]]
+        if body.normals is not None and np.isfinite(body.normals[i]).all():
+            row["normal"] = [round(float(v), 6) for v in body.normals[i]]
         targets.append(row)
     data: dict[str, Any] = {"format": FORMAT}
     if board is not None:
         data["board"] = board_entry(board)
-    if polarity != ("bright" if board is None else "dark"):
-        data["polarity"] = polarity
+    if body.polarity != ("bright" if board is None else "dark"):
+        data["polarity"] = body.polarity
     data["targets"] = targets
     write_text(Path(path), yaml_text(data, comment))
 
