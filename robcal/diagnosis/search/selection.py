@@ -243,13 +243,14 @@ def newly_visible(analysis: Analysis, tied: frozenset[str]) -> tuple[str, ...]:
     """
     seen: list[str] = []
     basis = analysis.basis
+    sigma = float(np.sqrt(analysis.fit.variance_factor))  # of the whitened observations, whatever they state
     for name in sorted(tied):
         column = analysis.at.parameters.get(name)
         if column is None:
             continue
         column = column * prior_scale(name, analysis.at.variables)
         rest = column - basis @ (basis.T @ column)
-        if np.linalg.norm(rest) > VISIBLE_SIGMA:
+        if np.linalg.norm(rest) > VISIBLE_SIGMA * sigma:
             seen.append(name)
             basis = np.column_stack([basis, rest / np.linalg.norm(rest)])
     return tuple(seen)
