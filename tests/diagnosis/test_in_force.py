@@ -52,7 +52,7 @@ def test_scatter_of_the_joints_makes_up_the_excess_of_variance() -> None:
 
 
 class Predicted:
-    """Errors of forty poses in eight folds: `useful` halves them, of `twin` and `other` either one does, `idle` none."""
+    """Errors of forty poses: `useful` halves them, of `twin` and `other` either one does, `idle` none."""
 
     def errors(self, dropped: tuple[str, ...] = ()) -> tuple[np.ndarray, np.ndarray]:
         size = np.random.default_rng(1).uniform(0.5, 1.5, 40)
