@@ -1,5 +1,6 @@
 """Tables in columns: frozen dataclasses whose arrays have one row for each item."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
@@ -33,4 +34,10 @@ class Columns:
 
     def joined(self, other: Self) -> Self:
         """The rows of this table, then those of the other."""
-        return replace(self, **{n: np.concatenate([c, getattr(other, n)]) for n, c in self._arrays().items()})
+        return self.concatenated([self, other])
+
+    @classmethod
+    def concatenated(cls, parts: Sequence[Self]) -> Self:
+        """The rows of all tables, one or more, in order."""
+        first = parts[0]
+        return replace(first, **{n: np.concatenate([getattr(p, n) for p in parts]) for n in first._arrays()})

@@ -36,7 +36,7 @@ def work(context: Context) -> Outcome:
         done = survey_one(campaign, run, name, source)
         body = surveyed_body(name, source.file, done, _not_on_it(campaign, run, name, source))
         outputs += [run.save(artifacts.survey(name), done), run.save(artifacts.surveyed_body(name), body)]
-        outputs += _write(run, name, source.survey, body, done)
+        outputs += _write(run, name, source, body, done)
         notes += [f"survey of '{name}': {note}" for note in _notes(done)]
         doubts = _against_given(campaign, source, done)
         notes += doubts.told(name)
@@ -54,7 +54,7 @@ def survey_one(campaign: Campaign, run: Run, name: str, source: BodySource) -> S
     entry, images_of = source.survey_entry, source.survey
     if entry is None or images_of is None:
         raise InvalidInput(f"{campaign.path}: body '{name}' has no survey")
-    _check_lengths(campaign, name, entry)
+    check_lengths(campaign, name, entry)
     images, size = _images(run, name, images_of, source.file)
     targets = [
         BodyTarget(t.id, t.code, t.diameter, t.xyz, None if t.sigma is None else max(t.sigma))
@@ -105,7 +105,9 @@ def located(error: RobcalError, where: str) -> RobcalError:
     """The same error with the place in front of its message."""
     if isinstance(error, NotIdentifiable):
         return NotIdentifiable(f"{where}: {error}", error.parameters)
-    return type(error)(f"{where}: {error}") if isinstance(error, InvalidInput | DegenerateGeometry) else error
+    if isinstance(error, InvalidInput):
+        return InvalidInput(f"{where}: {error}")
+    return DegenerateGeometry(f"{where}: {error}") if isinstance(error, DegenerateGeometry) else error
 
 
 def lengths(entries: list[ScaleBarEntry] | list[CheckLengthEntry]) -> Lengths | None:
@@ -119,7 +121,7 @@ def lengths(entries: list[ScaleBarEntry] | list[CheckLengthEntry]) -> Lengths | 
     )
 
 
-def _check_lengths(campaign: Campaign, name: str, entry: SurveyEntry) -> None:
+def check_lengths(campaign: Campaign, name: str, entry: SurveyEntry) -> None:
     """The same distance stated twice with different lengths is a contradiction of the file itself."""
     seen: dict[tuple[int, ...], tuple[float, int]] = {}
     for i, bar in enumerate(entry.scale_bars):
@@ -223,20 +225,11 @@ def surveyed_body(name: str, file: BodyFile, done: SurveyResult, beside: frozens
     )
 
 
-def _write(run: Run, name: str, source: ImageSource, body: Body, done: SurveyResult) -> list[Any]:
-    write_body(
-        run.body(name),
-        [int(i) for i in body.ids],
-        body.points,
-        body.covariance,
-        codes=body.codes,
-        diameters=[None if not np.isfinite(d) else float(d) for d in body.diameters],
-        polarity=body.polarity,
-        normals=body.normals,
-        comment=f"surveyed: {done.frame}; {done.scale}",
-    )
+def _write(run: Run, name: str, source: BodySource, body: Body, done: SurveyResult) -> list[Any]:
+    write_body(run.body(name), body, f"surveyed: {done.frame}; {done.scale}", source.file.board)
     sigma = np.sqrt(np.clip(np.diag(done.network.intrinsics_covariance), 0, None))
-    pixel = source.start.pixel_um if source.start is not None else None
+    start = source.survey.start if source.survey is not None else None
+    pixel = start.pixel_um if start is not None else None
     run.colmap(name).mkdir(parents=True, exist_ok=True)
     export_colmap(done.network, run.colmap(name))
     camera = CameraFile(done.network.camera, None, pixel, dict(zip(INTRINSIC_NAMES, map(float, sigma), strict=True)))

@@ -1,7 +1,7 @@
 """Bodies (format robcal/body-1): targets with codes, diameters and coordinates, as given or as surveyed."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -10,13 +10,13 @@ import numpy as np
 from robcal.errors import InvalidInput
 from robcal.files.schemas import Entry, NotNegative, Positive, Text, Triple, Whole, read_entry
 from robcal.files.storage import write_text
-from robcal.files.yaml_io import FlowMapping, yaml_text
+from robcal.files.yaml_io import FlowMapping, YamlDocument, yaml_text
 from robcal.imaging.ring_code import canonical_id, is_id
+from robcal.photogrammetry.boards.layout import Board, BoardKind
 from robcal.photogrammetry.core.bodies import Body
-from robcal.transforms import Array
 
 FORMAT = "robcal/body-1"
-CODES = ("ring12", "corner")
+CODES = ("ring12", "corner", "circle")
 
 
 class TargetEntry(Entry):
@@ -31,12 +31,34 @@ class TargetEntry(Entry):
     normal: Triple | None = None
 
 
+class ShapeEntry(Entry):
+    """The surface that carries the targets."""
+
+    kind: Literal["sphere"]
+    radius_mm: Positive
+
+
+class BoardEntry(Entry):
+    """A printed board in place of a list of targets."""
+
+    kind: BoardKind
+    columns: Whole
+    rows: Whole
+    square_mm: Positive | None = None
+    marker_mm: Positive | None = None
+    dictionary: Text | None = None
+    spacing_mm: Positive | None = None
+    diameter_mm: Positive | None = None
+
+
 class BodyEntry(Entry):
     """The whole file."""
 
     format: Literal["robcal/body-1"]
-    targets: list[TargetEntry]
-    polarity: Literal["bright", "dark"] = "bright"
+    targets: list[TargetEntry] | None = None
+    board: BoardEntry | None = None
+    shape: ShapeEntry | None = None
+    polarity: Literal["bright", "dark"] | None = None
 
 
 @dataclass(frozen=True)
@@ -54,11 +76,16 @@ class BodyTargetRow:
 
 @dataclass(frozen=True)
 class BodyFile:
-    """Content of a body file."""
+    """Content of a body file.
+
+    ``board`` where it is a printed one, whose targets are those of its layout; ``radius`` (m) of a sphere.
+    """
 
     path: Path
     targets: tuple[BodyTargetRow, ...]
     polarity: str
+    board: Board | None = None
+    radius: float | None = None
 
     def known(self) -> tuple[BodyTargetRow, ...]:
         """Targets with id and coordinates."""
@@ -70,54 +97,92 @@ def read_body(path: Path | str) -> BodyFile:
 
     Raises
     ------
-    InvalidInput : contradicts the contract: duplicate ids, two targets in one place, an impossible ring12 id.
+    InvalidInput : contradicts the format: duplicate ids, two targets in one place, a board that cannot be.
     """
     entry, document = read_entry(Path(path), BodyEntry, FORMAT)
-    rows: list[BodyTargetRow] = []
+    faults = list(_faults(entry, document))
+    if faults:
+        raise InvalidInput(faults[0], faults)
+    rows = [_row(target, entry.polarity or "bright") for target in entry.targets or ()]
+    if entry.board is not None:
+        return _with_board(entry, entry.board, document, rows)
+    if not rows:
+        raise InvalidInput(f"{document.path}: lists no targets: a body needs at least three, or a 'board'")
+    radius = None if entry.shape is None else entry.shape.radius_mm / 1000
+    return BodyFile(document.path, tuple(rows), entry.polarity or "bright", radius=radius)
+
+
+def _with_board(entry: BodyEntry, use: BoardEntry, document: YamlDocument, measured: list[BodyTargetRow]) -> BodyFile:
+    """The targets of a board's layout, those with measured coordinates there."""
+    mm = {name: getattr(use, f"{name}_mm") for name in ("square", "marker", "spacing", "diameter")}
+    lengths = {name: None if value is None else value / 1000 for name, value in mm.items()}
+    try:
+        board = Board(use.kind, use.columns, use.rows, dictionary=use.dictionary, **lengths)
+    except InvalidInput as error:
+        raise InvalidInput(f"{document.path}, line {document.line(('board',))}: {error}") from None
+    polarity = entry.polarity or "dark"
+    body = board.body()
+    rows = [
+        BodyTargetRow(i, body.codes[0], board.diameter, (x, y, z), None, polarity, (0.0, 0.0, -1.0))
+        for i, (x, y, z) in enumerate(body.points.tolist())
+    ]
+    for i, target in enumerate(measured):
+        if target.id is None or target.id >= len(rows) or target.xyz is None:
+            raise InvalidInput(
+                f"{document.path}, line {document.line(('targets', i))}: targets beside a 'board' are measured "
+                f"coordinates of its own ones: give an id from 0 to {len(rows) - 1} and xyz_mm"
+            )
+        own = rows[target.id]
+        rows[target.id] = replace(own, xyz=target.xyz, sigma=target.sigma, normal=target.normal or own.normal)
+    return BodyFile(document.path, tuple(rows), polarity, board)
+
+
+def _faults(entry: BodyEntry, document: YamlDocument) -> Iterator[str]:
+    """A sentence for each contradiction among the targets."""
     first: dict[int, int] = {}
     places: dict[tuple[float, float, float], int] = {}
-    for i, target in enumerate(entry.targets):
-        line = document.line(("targets", i))
-        where = f"{document.path}, line {line}"
+    listed = entry.targets or []
+    lines = [document.line(("targets", i)) or 0 for i in range(len(listed))]
+    for i, target in enumerate(listed):
+        where = f"{document.path}, line {lines[i]}"
         if target.id is not None:
             if target.id < 0:
-                raise InvalidInput(f"{where}: target id {target.id} is negative: ids count from 0")
-            if target.id in first:
-                raise InvalidInput(
-                    f"{where}: target {target.id} stands twice (first in line {first[target.id]}): remove one or give "
-                    "it its own id"
+                yield f"{where}: target id {target.id} is negative: ids count from 0"
+            if first.setdefault(target.id, i) != i:
+                yield (
+                    f"{where}: target {target.id} stands twice (first in line {lines[first[target.id]]}): remove one "
+                    "or give it its own id"
                 )
-            first[target.id] = line or 0
         if target.code is not None and target.code not in CODES and not target.code.startswith("aruco:"):
-            raise InvalidInput(
-                f"{where}: unknown code '{target.code}': use ring12, corner, aruco:<dictionary> or null (no code)"
+            yield (
+                f"{where}: unknown code '{target.code}': use ring12, aruco:<dictionary>, corner, circle or null (none)"
             )
         if target.code == "ring12" and target.id is None:
-            raise InvalidInput(f"{where}: a ring12 target needs its id (the number that its ring shows)")
+            yield f"{where}: a ring12 target needs its id (the number that its ring shows)"
         if target.xyz_mm is not None:
-            if target.xyz_mm in places:
-                raise InvalidInput(
-                    f"{where}: lies in the same place as the target of line {places[target.xyz_mm]}: "
+            if places.setdefault(target.xyz_mm, i) != i:
+                yield (
+                    f"{where}: lies in the same place as the target of line {lines[places[target.xyz_mm]]}: "
                     "check the coordinates"
                 )
-            places[target.xyz_mm] = line or 0
             if max(map(abs, target.xyz_mm)) > 1e6:
-                raise InvalidInput(f"{where}: coordinates beyond a kilometre: they are in mm")
-        sigma = target.sigma_mm
-        rows.append(
-            BodyTargetRow(
-                id=target.id,
-                code=target.code,
-                diameter=None if target.diameter_mm is None else target.diameter_mm / 1000,
-                xyz=None if target.xyz_mm is None else _metres(target.xyz_mm),
-                sigma=None if sigma is None else _metres(sigma if isinstance(sigma, tuple) else (sigma,) * 3),
-                polarity=target.polarity or entry.polarity,
-                normal=None if target.normal is None else _unit(target.normal, where),
-            )
-        )
-    if not rows:
-        raise InvalidInput(f"{document.path}: lists no targets: a body needs at least three")
-    return BodyFile(document.path, tuple(rows), entry.polarity)
+                yield f"{where}: coordinates beyond a kilometre: they are in mm"
+        length = 1.0 if target.normal is None else float(np.linalg.norm(target.normal))
+        if not 0.5 < length < 2.0:
+            yield f"{where}: normal has the length {length:g}: it is a direction of length 1"
+
+
+def _row(target: TargetEntry, polarity: str) -> BodyTargetRow:
+    sigma = target.sigma_mm
+    return BodyTargetRow(
+        id=target.id,
+        code=target.code,
+        diameter=None if target.diameter_mm is None else target.diameter_mm / 1000,
+        xyz=None if target.xyz_mm is None else _metres(target.xyz_mm),
+        sigma=None if sigma is None else _metres(sigma if isinstance(sigma, tuple) else (sigma,) * 3),
+        polarity=target.polarity or polarity,
+        normal=None if target.normal is None else _unit(target.normal),
+    )
 
 
 def _metres(values: Sequence[float]) -> tuple[float, float, float]:
@@ -125,10 +190,8 @@ def _metres(values: Sequence[float]) -> tuple[float, float, float]:
     return (x, y, z)
 
 
-def _unit(values: Sequence[float], where: str) -> tuple[float, float, float]:
+def _unit(values: Sequence[float]) -> tuple[float, float, float]:
     length = float(np.linalg.norm(values))
-    if not 0.5 < length < 2.0:
-        raise InvalidInput(f"{where}: normal has the length {length:g}: it is a direction of length 1")
     x, y, z = (v / length for v in values)
     return (x, y, z)
 
@@ -140,52 +203,60 @@ def check_ring_codes(body: BodyFile) -> None:
     ------
     InvalidInput : an id is not the smallest of its cyclic readings.
     """
+    faults = []
     for target in body.targets:
         code = target.id
         if target.code != "ring12" or code is None:
             continue
         if not 0 <= code < 4096:
-            raise InvalidInput(f"{body.path}: {code} is no ring12 id: twelve segments give 0 to 4095")
-        if not is_id(code):
-            raise InvalidInput(
+            faults.append(f"{body.path}: {code} is no ring12 id: twelve segments give 0 to 4095")
+        elif not is_id(code):
+            faults.append(
                 f"{body.path}: {code} is no ring12 id: the id is the smallest of its cyclic readings, here "
                 f"{canonical_id(code)}"
             )
+    if faults:
+        raise InvalidInput(faults[0], faults)
 
 
-def write_body(
-    path: Path | str,
-    ids: Sequence[int],
-    points: Array,
-    covariance: Array | None,
-    *,
-    codes: Sequence[str | None] | None = None,
-    diameters: Sequence[float | None] | None = None,
-    polarity: str = "bright",
-    normals: Array | None = None,
-    comment: str = "",
-) -> None:
-    """Write a body with coordinates (n, 3) in m and their covariance (3n, 3n) atomically.
+def write_body(path: Path | str, body: Body, comment: str = "", board: Board | None = None) -> None:
+    """Write a body with its coordinates atomically.
 
-    ``sigma_mm`` is written for x, y and z apart; the full covariance has its place in the stage's cache.
+    ``sigma_mm`` is written for x, y and z apart; the full covariance has its place in the stage's cache. Coordinates of
+    a ``board`` stand beside its layout.
     """
-    sigma = None if covariance is None else np.sqrt(np.clip(np.diag(covariance), 0, None)).reshape(-1, 3) * 1000
+    sigma = None
+    if body.covariance is not None:
+        sigma = np.sqrt(np.clip(np.diag(body.covariance), 0, None)).reshape(-1, 3) * 1000
     targets = []
-    for i, number in enumerate(ids):
-        row: dict[str, Any] = FlowMapping(id=int(number), code=codes[i] if codes else None)
-        diameter = diameters[i] if diameters else None
-        known = diameter is not None and np.isfinite(diameter)
-        row["diameter_mm"] = round(float(diameter) * 1000, 9) if diameter is not None and known else None
-        row["xyz_mm"] = [round(float(v), 9) for v in np.asarray(points[i]) * 1000]
+    for i, number in enumerate(body.ids):
+        row: dict[str, Any] = FlowMapping(id=int(number), code=body.codes[i] if board is None else None)
+        diameter = body.diameters[i]
+        row["diameter_mm"] = round(float(diameter) * 1000, 9) if np.isfinite(diameter) else None
+        row["xyz_mm"] = [round(float(v), 9) for v in body.points[i] * 1000]
         row["sigma_mm"] = None if sigma is None else [float(f"{v:.4g}") for v in sigma[i]]
-        if normals is not None and np.isfinite(normals[i]).all():
-            row["normal"] = [round(float(v), 6) for v in normals[i]]
+        if body.normals is not None and np.isfinite(body.normals[i]).all():
+            row["normal"] = [round(float(v), 6) for v in body.normals[i]]
         targets.append(row)
     data: dict[str, Any] = {"format": FORMAT}
-    if polarity != "bright":
-        data["polarity"] = polarity
+    if board is not None:
+        data["board"] = board_entry(board)
+    if body.polarity != ("bright" if board is None else "dark"):
+        data["polarity"] = body.polarity
     data["targets"] = targets
     write_text(Path(path), yaml_text(data, comment))
+
+
+def board_entry(board: Board) -> dict[str, Any]:
+    """A board as it stands in a body file."""
+    entry: dict[str, Any] = FlowMapping(kind=board.kind, columns=board.columns, rows=board.rows)
+    for name in ("square", "marker", "spacing", "diameter"):
+        length = getattr(board, name)
+        if length is not None:
+            entry[f"{name}_mm"] = round(length * 1000, 9)
+    if board.dictionary is not None:
+        entry["dictionary"] = board.dictionary
+    return entry
 
 
 def body_from_file(name: str, file: BodyFile) -> Body:

@@ -4,10 +4,11 @@ Pixels are (x, y) with the centre of the top-left pixel at (0, 0). The camera lo
 y down. Source of the model: OpenCV documentation, "Camera Calibration and 3D Reconstruction" (five coefficients).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from robcal.errors import InvalidInput
 from robcal.transforms import Array
@@ -31,6 +32,11 @@ class Camera:
     p1: float = 0.0
     p2: float = 0.0
     k3: float = 0.0
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the intrinsic parameters in the order of the vector."""
+        return INTRINSIC_NAMES
 
     @property
     def vector(self) -> Array:
@@ -123,6 +129,18 @@ def project_with_jacobians(camera: Camera, p_camera: ArrayLike) -> tuple[Array, 
     d_in[..., 0, 7] = camera.fx * (r2 + 2.0 * x * x)
     d_in[..., 1, 7] = camera.fy * 2.0 * x * y
     return np.stack([camera.fx * xd + camera.cx, camera.fy * yd + camera.cy], axis=-1), d_point, d_in
+
+
+def project_each(cameras: Sequence[Camera], camera: NDArray[np.integer], p_camera: Array) -> tuple[Array, Array, Array]:
+    """:func:`project_with_jacobians` of points (m, 3), each by its own one, ``camera`` (m,), of the ``cameras``."""
+    if len(cameras) == 1:
+        return project_with_jacobians(cameras[0], p_camera)
+    m = len(p_camera)
+    xy, d_point, d_in = np.empty((m, 2)), np.empty((m, 2, 3)), np.empty((m, 2, 9))
+    for c, one in enumerate(cameras):
+        rows = camera == c
+        xy[rows], d_point[rows], d_in[rows] = project_with_jacobians(one, p_camera[rows])
+    return xy, d_point, d_in
 
 
 def normalise(camera: Camera, xy: ArrayLike, iterations: int = 50) -> Array:

@@ -13,9 +13,9 @@ from robcal.imaging.detections import Detections, TargetKind
 from robcal.photogrammetry.core.bodies import Body, IntArray
 from robcal.photogrammetry.core.camera import Camera, project_with_jacobians
 from robcal.photogrammetry.core.eccentricity import effective_point
+from robcal.photogrammetry.identify.dots import match_dots
 from robcal.photogrammetry.identify.grow import View
-from robcal.photogrammetry.identify.search import match_dots
-from robcal.photogrammetry.orientation.resection import PoseFit, refine_poses
+from robcal.photogrammetry.orientation.resection import PoseFit, TargetMarks, refine_poses
 from robcal.transforms import Array, skew, transform
 
 _GATE = 5.0
@@ -169,18 +169,9 @@ def extended(body: Body, camera: Camera, starts: Sequence[Start]) -> list[Identi
         for (g, (rows, _)), mask in zip(matched, usable, strict=True):
             xy.append(g.start.detections.xy[rows[mask]])
             covariance.append(g.start.detections.covariance[rows[mask]] + g.error**2 * np.eye(2))
-        fit = refine_poses(
-            np.array([g.pose for g, _ in matched]),
-            pose,
-            np.zeros(len(pose), dtype=np.int64),
-            [camera],
-            np.eye(4)[None],
-            body.points[at],
-            np.concatenate(xy),
-            np.concatenate(covariance),
-            radius=0.5 * body.diameters[at],
-            normals=normals[at],
-        )
+        radius = 0.5 * body.diameters[at]
+        marks = TargetMarks(body.points[at], np.concatenate(xy), np.concatenate(covariance), radius, normals[at])
+        fit = refine_poses(np.array([g.pose for g, _ in matched]), pose, marks, camera)
         for k, (g, (rows, ids)) in enumerate(matched):
             g.take(rows, ids, fit, k)
     return [IdentifiedImage(g.rows, g.ids, g.pose, g.start.method) for g in images]

@@ -9,11 +9,12 @@ from numpy.typing import NDArray
 from robcal.imaging.detections import Detections, TargetKind
 from robcal.photogrammetry.core.bodies import Body, IntArray
 from robcal.photogrammetry.core.camera import Camera
+from robcal.photogrammetry.identify.dots import Dots
 from robcal.photogrammetry.identify.extension import IdentifiedImage, Prediction, Start, extended
 from robcal.photogrammetry.identify.grid import has_rows, search_grid
 from robcal.photogrammetry.identify.grow import View, view_of
 from robcal.photogrammetry.identify.search import search_body
-from robcal.photogrammetry.orientation.resection import Resection, refine_poses, resect_images
+from robcal.photogrammetry.orientation.resection import Resection, TargetMarks, refine_poses, resect_images
 
 _CROWD = 100
 """Dots in an image above which triples of dots are tried but briefly: they would not be enough in any time."""
@@ -84,7 +85,7 @@ def identify_images(
     return [
         image
         if image is not None
-        else _without_codes(images[k], body, camera, coded[k], expected[k], model_error_px, search, others)
+        else _without_codes(images[k], body, camera, coded[k], expected[k], model_error_px, others if search else None)
         for k, image in enumerate(out)
     ]
 
@@ -107,7 +108,7 @@ def _resected(
     ids = np.concatenate([coded[k][1][placed[k]] for k in several])
     xy = np.concatenate([images[k].xy[own] for k, own in zip(several, rows, strict=True)])
     covariance = np.concatenate([images[k].covariance[own] for k, own in zip(several, rows, strict=True)])
-    found = resect_images(camera, number, ids, xy, covariance, body, model_error_px=model_error_px)
+    found = resect_images(camera, number, ids, xy, covariance + model_error_px**2 * np.eye(2), body)
     return {
         k: replace(fit, inliers=fit.inliers[number == i])
         for i, (k, fit) in enumerate(zip(several, found, strict=True))
@@ -122,10 +123,9 @@ def _without_codes(
     coded: tuple[IntArray, IntArray],
     predictions: Sequence[Prediction],
     model_error_px: float,
-    search: bool,
-    others: Sequence[View],
+    others: Sequence[View] | None,
 ) -> IdentifiedImage:
-    """One image whose codes give no pose: by predictions, then by its geometry."""
+    """One image whose codes give no pose: by predictions, then by its geometry (not with ``others`` None)."""
     rows, ids = coded
     placed = body.known[body.index(ids)] if len(ids) else np.zeros(0, dtype=bool)
     best: IdentifiedImage | None = None
@@ -139,16 +139,14 @@ def _without_codes(
     dots = _free_dots(detections, rows)
     candidates = np.flatnonzero(body.known & ~np.isin(body.ids, ids) & _uncoded(body))
     reason = f"{len(ids)} coded targets read, too few for a pose"
-    if search and len(candidates) >= 4:
+    if others is not None and len(candidates) >= 4:
         if has_rows(body.points[candidates]) and len(dots) > len(candidates) // 2:
             grid = _from_rows(detections, body, camera, candidates, dots, model_error_px, others)
             if grid.method != "none" or grid.alternatives:
                 return _joined(rows, ids, grid)
         found, why = search_body(
             camera,
-            detections.xy[dots],
-            detections.covariance[dots],
-            detections.semi_axes[dots, 0],
+            Dots.of(detections, dots),
             body,
             candidates,
             model_error_px=model_error_px,
@@ -191,16 +189,8 @@ def _from_rows(
     others: Sequence[View],
 ) -> IdentifiedImage:
     """The search by rows of dots: one numbering, several (refused), or nothing with a reason."""
-    size = np.sqrt(detections.semi_axes[dots].prod(axis=1))
     found, why = search_grid(
-        camera,
-        detections.xy[dots],
-        size,
-        detections.contrast[dots],
-        body,
-        candidates,
-        model_error_px=model_error_px,
-        others=others,
+        camera, Dots.of(detections, dots), body.points[candidates], model_error_px=model_error_px, others=others
     )
     none = np.empty(0, dtype=np.int64)
     if len(found) != 1:
@@ -208,19 +198,10 @@ def _from_rows(
         return IdentifiedImage(none, none, None, "none", poses, _symmetric(len(found)) if found else why)
     best = found[0]
     rows, targets = dots[best.dots], candidates[best.targets]
-    zero = np.zeros(len(rows), dtype=np.int64)
     covariance = detections.covariance[rows] + best.rms**2 * np.eye(2)
     # the pose that belongs to the camera as given, not to the lens adjusted on the way
-    fit = refine_poses(
-        best.camera_T_body[None],
-        zero,
-        zero,
-        [camera],
-        np.eye(4)[None],
-        body.points[targets],
-        detections.xy[rows],
-        covariance,
-    )
+    marks = TargetMarks(body.points[targets], detections.xy[rows], covariance)
+    fit = refine_poses(best.camera_T_body[None], np.zeros(len(rows), dtype=np.int64), marks, camera)
     view = view_of(best, body.points[candidates])
     return IdentifiedImage(rows, body.ids[targets], fit.reference_T_body[0], "rows", view=view)
 

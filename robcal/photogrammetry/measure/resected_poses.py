@@ -6,7 +6,14 @@ from scipy import stats
 from robcal.estimation.grouping import sum_by
 from robcal.photogrammetry.core.bodies import Body, IntArray
 from robcal.photogrammetry.measure.measured_points import RejectedPoint, ResectedPoses
-from robcal.photogrammetry.orientation.resection import PoseFit, Resection, refine_poses, resect_images
+from robcal.photogrammetry.orientation.resection import (
+    PoseFit,
+    Resection,
+    Rig,
+    TargetMarks,
+    refine_poses,
+    resect_images,
+)
 from robcal.photogrammetry.station.adjustment import interior_basis, linearise
 from robcal.photogrammetry.station.network import MarkTable, StationOrientation, Unknowns
 from robcal.transforms import Array
@@ -107,19 +114,11 @@ def _fit_all(
     tiles = [rows[number[rows] == q] for q, _ in starts]
     tile = np.concatenate(tiles)
     which = np.repeat(np.arange(len(starts)), [len(t) for t in tiles])
-    fit = refine_poses(
-        np.array([T for _, T in starts]),
-        which,
-        table.exterior[tile],
-        [orientation.cameras[c] for c in orientation.exterior_camera],
-        orientation.world_T_exterior,
-        body.points[table.target[tile]],
-        table.xy[tile],
-        table.covariance[tile],
-        radius=table.radius[tile],
-        normals=table.normals[tile],
-        iterations=25,
-    )
+    points = body.points[table.target[tile]]
+    marks = TargetMarks(points, table.xy[tile], table.covariance[tile], table.radius[tile], table.normals[tile])
+    cameras = [orientation.cameras[c] for c in orientation.exterior_camera]
+    rig = Rig(table.exterior[tile], cameras, orientation.world_T_exterior)
+    fit = refine_poses(np.array([T for _, T in starts]), which, marks, rig, iterations=25)
     return fit, which, tile
 
 

@@ -6,7 +6,7 @@ a derivative by the station's parameters, so that a user can propagate it throug
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ from robcal.estimation.batched import NormalEquations, minimise_each
 from robcal.estimation.grouping import members, sum_by, whitener
 from robcal.estimation.summary import TerminationSettings
 from robcal.photogrammetry.core.bodies import IntArray
-from robcal.photogrammetry.core.camera import Camera, normalise, project_with_jacobians
+from robcal.photogrammetry.core.camera import Camera, normalise, project_each
 from robcal.transforms import Array, invert, skew, transform
 
 
@@ -70,73 +70,27 @@ def intersect(
     if len(point) == 0:
         raise InvalidInput("no marks to intersect")
     station = camera if exterior is None else exterior
-    n = int(point.max()) + 1
-    W = whitener(covariance)
     ideal = np.empty_like(xy)
     for c, cam in enumerate(cameras):
-        rows = camera == c
-        ideal[rows] = normalise(cam, xy[rows])
+        ideal[camera == c] = normalise(cam, xy[camera == c])
     used = np.asarray(np.isfinite(ideal).all(axis=1))
-    T = world_T_camera[station]
-    direction = np.einsum("mij,mj->mi", T[:, :3, :3], np.column_stack([ideal, np.ones(len(ideal))]))
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    across = np.eye(3) - direction[:, :, None] * direction[:, None, :]
-    across = np.where(used[:, None, None], across, 0.0)
-    A = sum_by(point, across, n)
-    b = sum_by(point, np.einsum("mij,mj->mi", across, np.where(used[:, None], T[:, :3, 3], 0.0)), n)
-    count = np.bincount(point[used], minlength=n).astype(np.int64)
-    regular: NDArray[np.bool_] = (count >= 2) & (np.linalg.eigvalsh(A)[:, 0] > 1e-9)
-    p = np.full((n, 3), np.nan)
-    p[regular] = np.linalg.solve(A[regular], b[regular][..., None])[..., 0]
-
-    def linearise(x: Array) -> tuple[Array, Array, Array, Array]:
-        p_camera = transform(invert(T), x[point])
-        r, d_point, d_in = np.empty((len(xy), 2)), np.empty((len(xy), 2, 3)), np.empty((len(xy), 2, 9))
-        for c, cam in enumerate(cameras):
-            rows = camera == c
-            value, d_point[rows], d_in[rows] = project_with_jacobians(cam, p_camera[rows])
-            r[rows] = xy[rows] - value
-        d_ext = d_point @ np.concatenate([np.broadcast_to(-np.eye(3), (len(xy), 3, 3)), skew(p_camera)], axis=-1)
-        d_world = d_point @ np.swapaxes(T[:, :3, :3], -1, -2)
-        mask = used[:, None, None]
-        ok = np.asarray(np.isfinite(d_world).all(axis=(1, 2)))[:, None, None] & mask
-        return (
-            np.where(ok[..., 0], np.einsum("mij,mj->mi", W, r), 0.0),
-            np.where(ok, W @ d_world, 0.0),
-            np.where(ok, W @ d_ext, 0.0),
-            np.where(ok, W @ d_in, 0.0),
-        )
-
-    def equations(x: Array, chosen: IntArray) -> NormalEquations:
-        rows, place = members(point, at[chosen], n)
-        rows, place = rows[used[rows]], place[used[rows]]
-        R, centre = T[rows, :3, :3], T[rows, :3, 3]
-        p_camera = np.einsum("mji,mj->mi", R, x[place] - centre)
-        predicted, d_point = np.empty((len(rows), 2)), np.empty((len(rows), 2, 3))
-        for c, cam in enumerate(cameras):
-            own = camera[rows] == c
-            predicted[own], d_point[own], _ = project_with_jacobians(cam, p_camera[own])
-        r = np.einsum("mij,mj->mi", W[rows], xy[rows] - predicted)
-        return NormalEquations.of_rows(place, r, W[rows] @ d_point @ np.swapaxes(R, -1, -2), len(chosen))
-
+    n = int(point.max()) + 1
+    rays = _Rays(n, point, camera, tuple(cameras), world_T_camera[station], xy, whitener(covariance), used)
+    p, regular = rays.start(ideal)
     at = np.flatnonzero(regular)
-    settings = TerminationSettings(iterations, negligible=1e-10)
-    p[at] = minimise_each(equations, np.add, p[at], settings).state
-    while count.max(initial=0) >= 3:
-        # redundancy-normalised residual per ray; drop the worst one of each point that has three or more
-        r, J, _, _ = linearise(p)
-        Q = _inverse(sum_by(point, np.swapaxes(J, -1, -2) @ J, n), regular)
-        V = np.eye(2) - J @ Q[point] @ np.swapaxes(J, -1, -2)
-        T2 = np.einsum("mi,mij,mj->m", r, np.linalg.pinv(V, rcond=1e-9, hermitian=True), r)
-        worst = np.zeros(n)
-        np.maximum.at(worst, point, np.where(used, T2, 0.0))
-        drop = used & (count[point] >= 3) & (worst[point] == T2) & (critical**2 + 2 < T2)
+
+    def refined(rays: _Rays) -> None:
+        settings = TerminationSettings(iterations, negligible=1e-10)
+        p[at] = minimise_each(lambda x, chosen: rays.equations(x, at[chosen]), np.add, p[at], settings).state
+
+    refined(rays)
+    while rays.count.max(initial=0) >= 3:
+        drop = rays.contradictions(p, regular, critical)
         if not drop.any():
             break
-        used = used & ~drop
-        count = np.bincount(point[used], minlength=n).astype(np.int64)
-        p[at] = minimise_each(equations, np.add, p[at], settings).state
-    r, J, d_ext, d_in = linearise(p)
+        rays = replace(rays, used=rays.used & ~drop)
+        refined(rays)
+    r, J, d_ext, d_in = rays.linearise(p)
     Q = _inverse(sum_by(point, np.swapaxes(J, -1, -2) @ J, n), regular)
     # implicit derivative: dp = -Q J' (J_station) d station
     pull = -Q[point] @ np.swapaxes(J, -1, -2)
@@ -146,7 +100,74 @@ def intersect(
     by_int = sum_by(point * c + camera, pull @ d_in, n * c).reshape(n, c, 3, 9)
     chi2 = sum_by(point, np.sum(r**2, axis=1), n)
     Q[~regular] = np.nan
-    return Intersection(p, Q, by_ext, by_int, count, chi2, used, r)
+    return Intersection(p, Q, by_ext, by_int, rays.count, chi2, rays.used, r)
+
+
+@dataclass(frozen=True)
+class _Rays:
+    """Rays (m,) to n points: numbers of point and camera, world_T_camera (m, 4, 4), px with whiteners (m, 2, 2), and
+    which take part."""
+
+    n: int
+    point: IntArray
+    camera: IntArray
+    cameras: tuple[Camera, ...]
+    T: Array
+    xy: Array
+    W: Array
+    used: NDArray[np.bool_]
+
+    @property
+    def count(self) -> IntArray:
+        """(n,) rays of each point that take part."""
+        return np.bincount(self.point[self.used], minlength=self.n).astype(np.int64)
+
+    def start(self, ideal: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Points (n, 3) nearest to the rays' lines (NaN where these do not meet), and which (n,) have one."""
+        direction = np.einsum("mij,mj->mi", self.T[:, :3, :3], np.column_stack([ideal, np.ones(len(ideal))]))
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        across = np.eye(3) - direction[:, :, None] * direction[:, None, :]
+        across = np.where(self.used[:, None, None], across, 0.0)
+        A = sum_by(self.point, across, self.n)
+        centre = np.where(self.used[:, None], self.T[:, :3, 3], 0.0)
+        b = sum_by(self.point, np.einsum("mij,mj->mi", across, centre), self.n)
+        regular: NDArray[np.bool_] = (self.count >= 2) & (np.linalg.eigvalsh(A)[:, 0] > 1e-9)
+        p = np.full((self.n, 3), np.nan)
+        p[regular] = np.linalg.solve(A[regular], b[regular][..., None])[..., 0]
+        return p, regular
+
+    def equations(self, x: Array, points: IntArray) -> NormalEquations:
+        """Normal equations of the ``points`` (a,) at x (a, 3)."""
+        rows, place = members(self.point, points, self.n)
+        rows, place = rows[self.used[rows]], place[self.used[rows]]
+        R, centre = self.T[rows, :3, :3], self.T[rows, :3, 3]
+        p_camera = np.einsum("mji,mj->mi", R, x[place] - centre)
+        predicted, d_point, _ = project_each(self.cameras, self.camera[rows], p_camera)
+        r = np.einsum("mij,mj->mi", self.W[rows], self.xy[rows] - predicted)
+        return NormalEquations.of_rows(place, r, self.W[rows] @ d_point @ np.swapaxes(R, -1, -2), len(points))
+
+    def linearise(self, x: Array) -> tuple[Array, Array, Array, Array]:
+        """Whitened residuals (m, 2) at points x (n, 3); derivatives by point, exterior and interior orientation."""
+        p_camera = transform(invert(self.T), x[self.point])
+        predicted, d_point, d_in = project_each(self.cameras, self.camera, p_camera)
+        m = len(self.xy)
+        d_ext = d_point @ np.concatenate([np.broadcast_to(-np.eye(3), (m, 3, 3)), skew(p_camera)], axis=-1)
+        d_world = d_point @ np.swapaxes(self.T[:, :3, :3], -1, -2)
+        ok = np.asarray(np.isfinite(d_world).all(axis=(1, 2)) & self.used)[:, None, None]
+        r = np.where(ok[..., 0], np.einsum("mij,mj->mi", self.W, self.xy - predicted), 0.0)
+        by_point, by_exterior, by_interior = (np.where(ok, self.W @ d, 0.0) for d in (d_world, d_ext, d_in))
+        return r, by_point, by_exterior, by_interior
+
+    def contradictions(self, p: Array, regular: NDArray[np.bool_], critical: float) -> NDArray[np.bool_]:
+        """(m,) the worst ray of each point with three or more, if its redundancy-normalised residual is too large."""
+        r, J, _, _ = self.linearise(p)
+        Q = _inverse(sum_by(self.point, np.swapaxes(J, -1, -2) @ J, self.n), regular)
+        V = np.eye(2) - J @ Q[self.point] @ np.swapaxes(J, -1, -2)
+        T2 = np.einsum("mi,mij,mj->m", r, np.linalg.pinv(V, rcond=1e-9, hermitian=True), r)
+        worst = np.zeros(self.n)
+        np.maximum.at(worst, self.point, np.where(self.used, T2, 0.0))
+        largest = (self.count[self.point] >= 3) & (worst[self.point] == T2)
+        return np.asarray(self.used & largest & (critical**2 + 2 < T2))
 
 
 def _regular(N: Array) -> Array:

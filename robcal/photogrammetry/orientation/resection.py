@@ -4,18 +4,19 @@ Closed form for the start (IPPE for planes, SQPnP otherwise, three-point search 
 least squares with the marks' covariances. A plane seen by one camera has two poses of similar fit; both are returned.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from robcal.columns import Columns
 from robcal.errors import DegenerateGeometry, InvalidInput
 from robcal.estimation.batched import NormalEquations, minimise_each
 from robcal.estimation.grouping import members, whitener
 from robcal.estimation.summary import TerminationSettings
 from robcal.photogrammetry.core.bodies import Body, IntArray, line_ratio
-from robcal.photogrammetry.core.camera import Camera, project, project_with_jacobians
+from robcal.photogrammetry.core.camera import Camera, project, project_each
 from robcal.photogrammetry.core.eccentricity import effective_point
 from robcal.photogrammetry.orientation.closed_form import LINE, start_poses, three_point_search
 from robcal.transforms import Array, invert, retract, skew, transform
@@ -64,63 +65,77 @@ class Resection:
     inliers: NDArray[np.bool_]
 
 
+@dataclass(frozen=True)
+class TargetMarks(Columns):
+    """Marks (m,) of known targets.
+
+    Attributes
+    ----------
+    points : (m, 3) m body coordinates of each mark's target. xy, covariance : (m, 2) px, (m, 2, 2) px^2.
+    radius, normals : (m,) m, (m, 3) of circular targets, for the eccentricity of their images; None: not modelled.
+    """
+
+    points: Array
+    xy: Array
+    covariance: Array
+    radius: Array | None = None
+    normals: Array | None = None
+
+    def seen_from(self, camera_T_body: Array) -> Array:
+        """(m, 3) in the camera's frame, of frames (4, 4) or (m, 4, 4): what projects to the centres of the images."""
+        p = transform(camera_T_body, self.points)
+        if self.radius is None or self.normals is None:
+            return p
+        return effective_point(p, np.einsum("...ij,...j->...i", camera_T_body[..., :3, :3], self.normals), self.radius)
+
+
+@dataclass(frozen=True)
+class Rig:
+    """The camera (m,) of each mark, the cameras, and their fixed exterior orientations reference_T_camera (c, 4, 4)."""
+
+    camera: IntArray
+    cameras: Sequence[Camera]
+    reference_T_camera: Array
+
+    @classmethod
+    def single(cls, camera: Camera, marks: int) -> "Rig":
+        """One camera, whose frame is the reference."""
+        return cls(np.zeros(marks, dtype=np.int64), (camera,), np.eye(4)[None])
+
+
 def refine_poses(
-    reference_T_body: Array,
-    pose: IntArray,
-    camera: IntArray,
-    cameras: Sequence[Camera],
-    reference_T_camera: Array,
-    points: Array,
-    xy: Array,
-    covariance: Array,
-    *,
-    radius: Array | None = None,
-    normals: Array | None = None,
-    iterations: int = 12,
+    reference_T_body: Array, pose: IntArray, marks: TargetMarks, view: Camera | Rig, iterations: int = 12
 ) -> PoseFit:
     """Poses of a body by least squares, one 6 x 6 system per pose, all poses at once (Levenberg damping per pose).
 
     Parameters
     ----------
-    reference_T_body : (k, 4, 4) start values.
-    pose, camera : (m,) which pose and which camera each mark belongs to.
-    cameras : the cameras; reference_T_camera (c, 4, 4) their fixed exterior orientations.
-    points : (m, 3) m body coordinates of each mark's target; xy (m, 2) px, covariance (m, 2, 2) px^2.
-    radius, normals : (m,), (m, 3) of circular targets, for the eccentricity of their images.
+    reference_T_body : (k, 4, 4) start values. pose : (m,) which of them each mark belongs to.
+    view : the camera of all marks (its frame is the reference), or which one of several each mark is of.
     """
     k = len(reference_T_body)
-    W = whitener(covariance)
-    camera_T_reference = invert(reference_T_camera)
-
-    def camera_points(poses: Array, rows: IntArray, place: IntArray) -> tuple[Array, Array]:
-        camera_T_body = (camera_T_reference[camera[rows]] @ poses[place]) if len(rows) else np.empty((0, 4, 4))
-        p_camera = transform(camera_T_body, points[rows])
-        if radius is not None and normals is not None:
-            turned = np.einsum("mij,mj->mi", camera_T_body[:, :3, :3], normals[rows])
-            p_camera = effective_point(p_camera, turned, radius[rows])
-        return p_camera, camera_T_body[:, :3, :3]
+    rig = Rig.single(view, len(pose)) if isinstance(view, Camera) else view
+    W = whitener(marks.covariance)
+    camera_T_reference = invert(rig.reference_T_camera)
 
     def equations(poses: Array, chosen: IntArray) -> NormalEquations:
         rows, place = members(pose, chosen, k)
-        p_camera, R = camera_points(poses, rows, place)
-        predicted, d_point = np.empty((len(rows), 2)), np.empty((len(rows), 2, 3))
-        for c, cam in enumerate(cameras):
-            own = camera[rows] == c
-            predicted[own], d_point[own], _ = project_with_jacobians(cam, p_camera[own])
-        r = np.einsum("mij,mj->mi", W[rows], xy[rows] - predicted)
-        J = W[rows] @ d_point @ np.concatenate([R, -R @ skew(points[rows])], axis=-1)
+        mine = marks.select(rows)
+        camera_T_body = camera_T_reference[rig.camera[rows]] @ poses[place]
+        R = camera_T_body[:, :3, :3]
+        predicted, d_point, _ = project_each(rig.cameras, rig.camera[rows], mine.seen_from(camera_T_body))
+        r = np.einsum("mij,mj->mi", W[rows], mine.xy - predicted)
+        J = W[rows] @ d_point @ np.concatenate([R, -R @ skew(mine.points)], axis=-1)
         return NormalEquations.of_rows(place, r, J, len(chosen))
 
     settings = TerminationSettings(iterations, cost_tolerance=1e-8, negligible=1e-14)
     found = minimise_each(equations, _turned_little, reference_T_body, settings)
-    p_camera, _ = camera_points(found.state, np.arange(len(pose)), pose)
-    predicted = np.empty((len(pose), 2))
-    for c, cam in enumerate(cameras):
-        predicted[camera == c] = project(cam, p_camera[camera == c])
+    seen = marks.seen_from(camera_T_reference[rig.camera] @ found.state[pose])
+    residual = marks.xy - project_each(rig.cameras, rig.camera, seen)[0]
     count = np.bincount(pose, minlength=k).astype(np.int64)
     C = found.equations.inverse()
     C[count < 3] = np.nan
-    return PoseFit(found.state, C, found.equations.cost, count, np.einsum("mij,mj->mi", W, xy - predicted))
+    return PoseFit(found.state, C, found.equations.cost, count, np.einsum("mij,mj->mi", W, residual))
 
 
 def _turned_little(T: Array, step: Array) -> Array:
@@ -130,14 +145,7 @@ def _turned_little(T: Array, step: Array) -> Array:
 
 
 def resect(
-    camera: Camera,
-    ids: Sequence[int] | IntArray,
-    xy: Array,
-    covariance: Array,
-    body: Body,
-    *,
-    gate: float = 4.0,
-    model_error_px: float = 0.0,
+    camera: Camera, ids: Sequence[int] | IntArray, xy: Array, covariance: Array, body: Body, *, gate: float = 4.0
 ) -> Resection:
     """Pose of a body from the marks of one image; see :func:`resect_images`.
 
@@ -146,8 +154,7 @@ def resect(
     DegenerateGeometry : fewer than three marks of known targets, in one line, or no pose that three of them agree on.
     InvalidInput : a mark of a target that the body does not have.
     """
-    image = np.zeros(len(xy), dtype=np.int64)
-    result = resect_images(camera, image, ids, xy, covariance, body, gate=gate, model_error_px=model_error_px)[0]
+    result = resect_images(camera, np.zeros(len(xy), dtype=np.int64), ids, xy, covariance, body, gate=gate)[0]
     if isinstance(result, DegenerateGeometry):
         raise result
     return result
@@ -162,16 +169,15 @@ def resect_images(
     body: Body,
     *,
     gate: float = 4.0,
-    model_error_px: float = 0.0,
 ) -> list[Resection | DegenerateGeometry]:
     """Poses of a body from many images of one camera, misidentified marks left out.
 
     Parameters
     ----------
     image : (m,) number of each mark's image, 0 .. k-1.
-    ids, xy, covariance : (m,), (m, 2) px, (m, 2, 2) px^2 of the marks; ids must belong to the body.
+    ids, xy, covariance : (m,), (m, 2) px, (m, 2, 2) px^2 of the marks; ids must belong to the body. Where the camera
+        is only a start value, the covariance includes what that may cause.
     gate : marks further off than this many standard deviations are outliers.
-    model_error_px : what the camera's start values may be wrong by, added to the marks' covariance.
 
     Returns
     -------
@@ -185,60 +191,37 @@ def resect_images(
     if np.any(at < 0):
         raise InvalidInput(f"body {body.name} has no target {np.asarray(ids)[at < 0][0]}")
     k = int(image.max()) + 1 if len(image) else 0
-    keep = body.known[at]
-    C = np.asarray(covariance, dtype=float) + model_error_px**2 * np.eye(2)
-    data = _Marks(
-        camera, body.points[at], np.asarray(xy, dtype=float), C, 0.5 * body.diameters[at], body.estimated_normals()[at]
+    marks = TargetMarks(
+        body.points[at],
+        np.asarray(xy, dtype=float),
+        np.asarray(covariance, dtype=float),
+        0.5 * body.diameters[at],
+        body.estimated_normals()[at],
     )
-    rows_of = [np.flatnonzero(keep & (image == i)) for i in range(k)]
+    rows_of = [np.flatnonzero(body.known[at] & (image == i)) for i in range(k)]
     failed: dict[int, DegenerateGeometry] = {}
-    tasks: list[tuple[int, Array, IntArray]] = []
+    tasks: list[_Task] = []
     for i, rows in enumerate(rows_of):
         try:
-            starts = start_poses(camera, data.xy[rows], data.points[rows])
+            tasks += [(i, T, rows) for T in start_poses(camera, marks.xy[rows], marks.points[rows])]
         except DegenerateGeometry as error:
             failed[i] = error
-            continue
-        tasks += [(i, T, rows) for T in starts]
-    solutions = _refine_tasks(data, tasks, k)
-    again: list[tuple[int, Array, IntArray]] = []
-    inside = dict(enumerate(rows_of))
-    for i, rows in enumerate(rows_of):
-        m = len(rows)
-        if i in failed or m <= 3:
-            continue
-        limit = 2 * m - 6 + gate * np.sqrt(2 * (2 * m - 6) + 1)
-        if solutions[i] and solutions[i][0].cost <= max(limit, gate**2):
-            continue
-        found = _without_outliers(data, rows, gate)
-        if found is not None:
-            pose, inside[i] = found
-            again.append((i, pose, inside[i]))
-            if line_ratio(data.points[inside[i]]) > LINE:
-                again += [(i, T, inside[i]) for T in start_poses(camera, data.xy[inside[i]], data.points[inside[i]])]
-        # else: no consistent subset of four; the fit to all marks stands, with its large chi-square
-    for i, better in enumerate(_refine_tasks(data, again, k)):
+    solutions = _refine_tasks(camera, marks, tasks, k)
+    suspect = {i: rows for i, rows in enumerate(rows_of) if i not in failed and not _fits(solutions[i], rows, gate)}
+    again = _tasks_without_outliers(camera, marks, suspect, gate)
+    inside = dict(enumerate(rows_of)) | {i: rows for i, _, rows in again}
+    for i, better in enumerate(_refine_tasks(camera, marks, again, k)):
         if better:
             solutions[i] = better
-    out: list[Resection | DegenerateGeometry] = []
-    for i in range(k):
-        if i in failed or not solutions[i]:
-            reason = failed.get(i)
-            text = "no pose agrees with the targets of the image: wrong ids, another body or a wrong camera file"
-            out.append(reason if reason is not None else DegenerateGeometry(text))
-            continue
-        out.append(_choose(solutions[i], inside[i], len(xy)))
-    return out
+    nothing = "no pose agrees with the targets of the image: wrong ids, another body or a wrong camera file"
+    return [
+        _choose(solutions[i], inside[i], len(xy)) if solutions[i] else failed.get(i, DegenerateGeometry(nothing))
+        for i in range(k)
+    ]
 
 
-@dataclass(frozen=True)
-class _Marks:
-    camera: Camera
-    points: Array
-    xy: Array
-    covariance: Array
-    radius: Array
-    normals: Array
+_Task = tuple[int, Array, IntArray]
+"""Number of the image, start pose camera_T_body, rows of the marks."""
 
 
 @dataclass(frozen=True)
@@ -248,44 +231,59 @@ class _Solution:
     cost: float
 
 
-def _refine_tasks(data: _Marks, tasks: list[tuple[int, Array, IntArray]], k: int) -> list[list[_Solution]]:
-    """Least-squares poses of (image, start pose, rows), sorted by cost, per image."""
+def _fits(solutions: list[_Solution], rows: IntArray, gate: float) -> bool:
+    """Whether all marks of an image agree with its best pose (or are too few to tell)."""
+    redundancy = 2 * len(rows) - 6
+    if redundancy <= 0:
+        return True
+    limit = redundancy + gate * np.sqrt(2 * redundancy + 1)
+    return bool(solutions) and solutions[0].cost <= max(limit, gate**2)
+
+
+def _tasks_without_outliers(
+    camera: Camera, marks: TargetMarks, images: Mapping[int, IntArray], gate: float
+) -> list[_Task]:
+    """New starts of the images; none for one without a consistent subset of four (its fit to all marks stands)."""
+    tasks: list[_Task] = []
+    for i, rows in images.items():
+        found = _without_outliers(camera, marks, rows, gate)
+        if found is None:
+            continue
+        pose, inside = found
+        tasks.append((i, pose, inside))
+        if line_ratio(marks.points[inside]) > LINE:
+            tasks += [(i, T, inside) for T in start_poses(camera, marks.xy[inside], marks.points[inside])]
+    return tasks
+
+
+def _refine_tasks(camera: Camera, marks: TargetMarks, tasks: list[_Task], k: int) -> list[list[_Solution]]:
+    """Least-squares poses, sorted by cost, per image."""
     solutions: list[list[_Solution]] = [[] for _ in range(k)]
     if not tasks:
         return solutions
     rows = np.concatenate([task[2] for task in tasks])
     which = np.repeat(np.arange(len(tasks)), [len(task[2]) for task in tasks])
-    fit = refine_poses(
-        np.array([task[1] for task in tasks]),
-        which,
-        np.zeros(len(rows), dtype=np.int64),
-        [data.camera],
-        np.eye(4)[None],
-        data.points[rows],
-        data.xy[rows],
-        data.covariance[rows],
-        radius=data.radius[rows],
-        normals=data.normals[rows],
-        iterations=25,
-    )
+    fit = refine_poses(np.array([task[1] for task in tasks]), which, marks.select(rows), camera, iterations=25)
     for j, (i, _, _) in enumerate(tasks):
         if np.isfinite(fit.cost[j]):
             solutions[i].append(_Solution(fit.reference_T_body[j], fit.covariance[j], float(fit.cost[j])))
     return [sorted(found, key=lambda s: s.cost) for found in solutions]
 
 
-def _without_outliers(data: _Marks, rows: IntArray, gate: float) -> tuple[Array, IntArray] | None:
+def _without_outliers(camera: Camera, marks: TargetMarks, rows: IntArray, gate: float) -> tuple[Array, IntArray] | None:
     """Pose and rows of the marks that agree with it (at least four), by three-point search and re-selection."""
-    sigma = float(np.sqrt(np.median(np.einsum("mii->m", data.covariance[rows])) / 2))
-    pose, near = three_point_search(data.camera, data.xy[rows], data.points[rows], tolerance_px=3 * gate * sigma)
+    mine = marks.select(rows)
+    sigma = float(np.sqrt(np.median(np.einsum("mii->m", mine.covariance)) / 2))
+    pose, near = three_point_search(camera, mine.xy, mine.points, tolerance_px=3 * gate * sigma)
     if pose is None or near.sum() < 4:
         return None
     for _ in range(4):
-        fit = _refine_tasks(data, [(0, pose, rows[near])], 1)[0]
+        fit = _refine_tasks(camera, marks, [(0, pose, rows[near])], 1)[0]
         if not fit:
             return None
         pose = fit[0].pose
-        again = np.linalg.norm(_whiten(data, pose, rows), axis=1) < gate + 1
+        off = np.einsum("mij,mj->mi", whitener(mine.covariance), mine.xy - project(camera, mine.seen_from(pose)))
+        again = np.linalg.norm(np.where(np.isfinite(off), off, np.inf), axis=1) < gate + 1
         if again.sum() < 4 or np.array_equal(again, near):
             break
         near = again
@@ -306,10 +304,3 @@ def _choose(solutions: list[_Solution], rows: IntArray, marks: int) -> Resection
     variance = max(1.0, best.cost / redundancy) if redundancy > 0 else 1.0
     ambiguous = other is not None and cost_other - best.cost < 14 * variance
     return Resection(best.pose, best.covariance, other, ambiguous, best.cost, redundancy, cost_other, mask)
-
-
-def _whiten(data: _Marks, camera_T_body: Array, rows: IntArray) -> Array:
-    normals = data.normals[rows] @ camera_T_body[:3, :3].T
-    p = effective_point(transform(camera_T_body, data.points[rows]), normals, data.radius[rows])
-    off = np.einsum("mij,mj->mi", whitener(data.covariance[rows]), data.xy[rows] - project(data.camera, p))
-    return np.where(np.isfinite(off), off, np.inf)

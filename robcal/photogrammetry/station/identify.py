@@ -260,10 +260,9 @@ def _prediction(
             continue
         d, usable = detections[other][pose], body.known[body.index(image.ids)]
         rows = image.rows[usable]
+        covariance = d.covariance[rows] + 0.5**2 * np.eye(2)
         try:
-            fit = resect(
-                orientation.cameras[c], image.ids[usable], d.xy[rows], d.covariance[rows], body, model_error_px=0.5
-            )
+            fit = resect(orientation.cameras[c], image.ids[usable], d.xy[rows], covariance, body)
         except RobcalError:
             continue  # too few targets or all in a line: no prediction from this camera
         frame = invert(world_T_camera(name)) @ world_T_camera(other) @ fit.camera_T_body

@@ -9,7 +9,7 @@ import numpy as np
 from robcal.errors import DegenerateGeometry, InvalidInput
 from robcal.photogrammetry.core.bodies import Body, IntArray
 from robcal.photogrammetry.core.camera import Camera
-from robcal.photogrammetry.orientation.resection import Resection, refine_poses, resect_images
+from robcal.photogrammetry.orientation.resection import Resection, Rig, TargetMarks, refine_poses, resect_images
 from robcal.photogrammetry.station.network import StationMarks
 from robcal.transforms import Array, difference, invert, retract
 
@@ -48,19 +48,11 @@ def focal_start(marks: StationMarks, body: Body, size: tuple[int, int], sigma_px
         raise DegenerateGeometry("no image shows four or more targets: give a camera file with start values")
     rows = np.isin(marks.pose, chosen)
     image = np.searchsorted(np.sort(chosen), marks.pose[rows])
+    ids, xy, covariance = marks.target[rows], marks.xy[rows], marks.covariance[rows] + sigma_px**2 * np.eye(2)
 
     def score(factor: float) -> float:
         camera = Camera.from_size(*size, focal_factor=factor)
-        fits = resect_images(
-            camera,
-            image,
-            marks.target[rows],
-            marks.xy[rows],
-            marks.covariance[rows],
-            body,
-            gate=1e6,
-            model_error_px=sigma_px,
-        )
+        fits = resect_images(camera, image, ids, xy, covariance, body, gate=1e6)
         values = [r.chi2 / max(1, r.redundancy) if isinstance(r, Resection) else 1e12 for r in fits]
         return float(np.median(values))
 
@@ -80,9 +72,8 @@ def resect_station(
     for c in range(len(names)):
         m = marks[c]
         poses, image = np.unique(m.pose, return_inverse=True)
-        fits = resect_images(
-            cameras[c], image.astype(np.int64), m.target, m.xy, m.covariance, body, model_error_px=sigma_px
-        )
+        covariance = m.covariance + sigma_px**2 * np.eye(2)
+        fits = resect_images(cameras[c], image.astype(np.int64), m.target, m.xy, covariance, body)
         for i, (pose, fit) in enumerate(zip(poses, fits, strict=True)):
             if isinstance(fit, DegenerateGeometry):
                 failed.append((c, int(pose), str(fit)))
@@ -117,16 +108,9 @@ def find_swap(
         for s in richest:
             m = marks[s.camera]
             rows = np.flatnonzero(m.pose == s.pose)
-            fit = resect_images(
-                cameras[s.camera],
-                np.zeros(len(rows), dtype=np.int64),
-                m.target[rows],
-                m.xy[rows],
-                m.covariance[rows],
-                trial,
-                gate=1e6,
-                model_error_px=sigma_px,
-            )[0]
+            image = np.zeros(len(rows), dtype=np.int64)
+            covariance = m.covariance[rows] + sigma_px**2 * np.eye(2)
+            fit = resect_images(cameras[s.camera], image, m.target[rows], m.xy[rows], covariance, trial, gate=1e6)[0]
             values.append(fit.chi2 / max(1, fit.redundancy) if isinstance(fit, Resection) else 1e12)
         return float(np.median(values))
 
@@ -300,27 +284,17 @@ def start_bodies(
             for T in s.candidates:
                 candidates.append(world_T_camera[s.camera] @ T)
                 owner.append(pose)
-    parts: dict[str, list[np.ndarray]] = {"which": [], "camera": [], "points": [], "xy": [], "covariance": []}
+    which, camera = [], []
+    parts: list[TargetMarks] = []
     for k, pose in enumerate(owner):
         for s in by_pose[pose]:
-            n = len(s.rows)
             m = marks[s.camera]
-            parts["which"].append(np.full(n, k))
-            parts["camera"].append(np.full(n, s.camera))
-            parts["points"].append(body.points[body.index(m.target[s.rows])])
-            parts["xy"].append(m.xy[s.rows])
-            parts["covariance"].append(m.covariance[s.rows] + sigma_px**2 * np.eye(2))
-    joined = {name: np.concatenate(values) for name, values in parts.items()}
-    fit = refine_poses(
-        np.array(candidates),
-        joined["which"],
-        joined["camera"],
-        cameras,
-        world_T_camera,
-        joined["points"],
-        joined["xy"],
-        joined["covariance"],
-    )
+            which.append(np.full(len(s.rows), k))
+            camera.append(np.full(len(s.rows), s.camera))
+            covariance = m.covariance[s.rows] + sigma_px**2 * np.eye(2)
+            parts.append(TargetMarks(body.points[body.index(m.target[s.rows])], m.xy[s.rows], covariance))
+    rig = Rig(np.concatenate(camera), cameras, world_T_camera)
+    fit = refine_poses(np.array(candidates), np.concatenate(which), TargetMarks.concatenated(parts), rig)
     out: dict[int, tuple[Array, float, float, int]] = {}
     own = np.array(owner)
     for pose, images in by_pose.items():
