@@ -8,7 +8,16 @@ class RobcalError(Exception):
 
 
 class InvalidInput(RobcalError):
-    """Data or settings that contradict their format: a NaN, a wrong unit, an unknown name."""
+    """Data or settings that contradict their format: a NaN, a wrong unit, an unknown name.
+
+    Attributes
+    ----------
+    faults : a sentence for each fault, where a reader found several at once; the error's text is the first.
+    """
+
+    def __init__(self, message: str, faults: Iterable[str] = ()) -> None:
+        super().__init__(message)
+        self.faults: tuple[str, ...] = tuple(faults) or (message,)
 
 
 class DegenerateGeometry(RobcalError):
@@ -32,4 +41,6 @@ def located(error: RobcalError, where: str) -> RobcalError:
     """The same error with the place in front of its message."""
     if isinstance(error, NotIdentifiable):
         return NotIdentifiable(f"{where}: {error}", error.parameters)
-    return type(error)(f"{where}: {error}") if isinstance(error, InvalidInput | DegenerateGeometry) else error
+    if isinstance(error, InvalidInput):
+        return InvalidInput(f"{where}: {error}")
+    return DegenerateGeometry(f"{where}: {error}") if isinstance(error, DegenerateGeometry) else error

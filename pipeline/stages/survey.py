@@ -54,7 +54,7 @@ def survey_one(campaign: Campaign, run: Run, name: str, source: BodySource) -> S
     entry, images_of = source.survey_entry, source.survey
     if entry is None or images_of is None:
         raise InvalidInput(f"{campaign.path}: body '{name}' has no survey")
-    _check_lengths(campaign, name, entry)
+    check_lengths(campaign, name, entry)
     images, size = _images(run, name, images_of, source.file)
     datum = tuple(entry.datum.fixed) if isinstance(entry.datum, FixedDatum) else entry.datum
     try:
@@ -104,7 +104,7 @@ def lengths(entries: list[ScaleBarEntry] | list[CheckLengthEntry]) -> Lengths | 
     )
 
 
-def _check_lengths(campaign: Campaign, name: str, entry: SurveyEntry) -> None:
+def check_lengths(campaign: Campaign, name: str, entry: SurveyEntry) -> None:
     """The same distance stated twice with different lengths is a contradiction of the file itself."""
     seen: dict[tuple[int, ...], tuple[float, int]] = {}
     for i, bar in enumerate(entry.scale_bars):
