@@ -48,7 +48,8 @@ def sources(campaign: Campaign) -> dict[str, tuple[ImageSource, BodyFile, Survey
     return found
 
 
-def _settings(body: BodyFile, survey: SurveyEntry | None) -> DetectionSettings:
+def settings_for(body: BodyFile, survey: SurveyEntry | None) -> DetectionSettings:
+    """What to look for in images of a body: those of a survey, or of a station."""
     return detection_settings(body, None if survey is None else survey.ends)
 
 
@@ -84,7 +85,7 @@ def work(context: Context) -> Outcome:
     hashes: dict[str, dict[str, str]] = {}
     version = code_version("robcal.files.images", "robcal.imaging.detect")
     for source, (images, body, survey) in sources(campaign).items():
-        settings = _settings(body, survey)
+        settings = settings_for(body, survey)
         for name, path in images.images.items():
             content = run.hash(path)
             refuse_duplicate(hashes.setdefault(source, {}), content, path)
@@ -115,7 +116,7 @@ STAGE = Stage(
         path for images, body, _ in sources(campaign).values() for path in (*images.images.values(), body.path)
     ],
     settings=lambda campaign: {
-        source: [codec.encode(_settings(body, survey), {}), list(images.images), images.size]
+        source: [codec.encode(settings_for(body, survey), {}), list(images.images), images.size]
         for source, (images, body, survey) in sources(campaign).items()
     },
     after=(),
