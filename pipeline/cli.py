@@ -74,6 +74,27 @@ def run(
         LOG.info(f"results in {done.run.folder}")
 
 
+@app.command(short_help="All faults of a campaign at once, before any long work.")
+def check(campaign: CampaignPath, quiet: Quiet = False, as_json: Json = False) -> None:
+    """Look for everything that would stop a run, or is doubtful: a line each on standard output, with file and row.
+
+    Exit code 1 if anything would stop a run. Reads all files and looks into a few images; writes nothing.
+    """
+    with answers("check", as_json, quiet) as answer:
+        from pipeline.checking.check import check_campaign
+        from pipeline.checking.told import as_data, as_lines
+
+        found = check_campaign(campaign)
+        answer.update(as_data(found))
+        if not as_json:
+            for line in as_lines(found, quiet):
+                typer.echo(line)
+        if found.faults:
+            answer["ok"] = False
+    if answer["faults"]:
+        raise typer.Exit(1)
+
+
 @app.command()
 def survey(
     campaign: CampaignPath,

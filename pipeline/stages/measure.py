@@ -95,7 +95,10 @@ STAGE = Stage(
         *(table.path for table in campaign.measured("points")),
         *(body.file.path for body in campaign.bodies.values()),
     ],
-    settings=lambda campaign: [list(campaign.poses.names) if campaign.poses else [], campaign.entry.measurements],
+    settings=lambda campaign: [
+        list(campaign.poses.names) if campaign.poses else [],
+        [m.model_dump() for m in campaign.entry.measurements],
+    ],
     after=("detect", "survey", "orient"),
     module=__name__,
 )
