@@ -70,6 +70,12 @@ class SurveyEntry(Entry):
     check_lengths: list[CheckLengthEntry] = Field(default_factory=list)
     datum: Literal["free", "bars"] | FixedDatum = "free"
 
+    @property
+    def ends(self) -> frozenset[int]:
+        """Targets of scale bars and check lengths."""
+        pairs = [*(bar.targets for bar in self.scale_bars), *(length.targets for length in self.check_lengths)]
+        return frozenset(number for pair in pairs for number in pair)
+
 
 class BodyUse(Entry):
     """A body of the campaign."""

@@ -11,10 +11,10 @@ from pipeline.artifacts import CALIBRATED, DETECTED, HAND_EYE, IDENTIFICATION
 from pipeline.bodies import surveyed_or_given
 from pipeline.campaign import Campaign, HandEyeSource
 from pipeline.campaign_schema import HandEyeEntry
+from pipeline.detected_images import load_detections, sizes
 from pipeline.json_io import write_json
 from pipeline.runs import Run
 from pipeline.stages.base import Context, Outcome, Stage
-from pipeline.stages.detect import load_detections, sizes
 from pipeline.stages.survey import located, size_of_marks
 from robcal.calibration.calibrated import CalibratedRobot
 from robcal.diagnosis.content import with_images
