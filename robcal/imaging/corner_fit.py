@@ -7,6 +7,7 @@ carry a normal prior whose mean and variance come from all corners of the image 
 censored.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -108,17 +109,24 @@ def model_values(parameters: Array, windows: CornerWindows) -> tuple[Array, Arra
     return b0 + b1 * u + b2 * v + amplitude * profile, jacobian
 
 
-def fit_corners(windows: CornerWindows, start: Array, noise: NoiseModel) -> CornerFits:
+def fit_corners(
+    windows: CornerWindows,
+    start: Array,
+    noise: NoiseModel,
+    curvature_of: Callable[[Array, NDArray[np.bool_]], Array] | None = None,
+) -> CornerFits:
     """Fit all corners.
 
     Parameters
     ----------
     start : (n, 5) shape: place from the window's origin, angles of the normals of both edges, ln s.
+    curvature_of : the edges' curvatures (n, 2) from better places (n, 2) px, of which some (n,) are good.
 
     Notes
     -----
-    Two rounds: the first gives the noise and the shading of the image, the second uses both and leaves single outlying
-    pixels out. Covariances grow with residuals beyond noise and with the correlation of neighbouring pixels.
+    Two rounds: the first gives the noise and the shading of the image and places from which the edges' curvature is
+    known, the second uses all that and leaves single outlying pixels out. Covariances grow with residuals beyond noise
+    and with the correlation of neighbouring pixels.
     """
     parameters = np.zeros((len(start), PARAMETERS))
     parameters[:, :SHAPE_PARAMETERS] = start
@@ -128,6 +136,9 @@ def fit_corners(windows: CornerWindows, start: Array, noise: NoiseModel) -> Corn
     first = _minimise(parameters, windows, valid, noise, start[:, 4], shading)
     noise, correlation = _seen_noise(first, noise, windows)
     shading = _shading(first)
+    if curvature_of is not None:
+        good = first.converged & (_chi2(first)[0] < 4.0)
+        windows = replace(windows, curvature=curvature_of(first.parameters[:, :2] + windows.origin, good))
     second = _minimise(first.parameters, windows, valid, noise, start[:, 4], shading)
     odd = np.abs(second.residual) > np.maximum(
         _OUTLIER_SIGMA / np.sqrt(np.maximum(second.precision, 1e-12)),
