@@ -1,15 +1,17 @@
 """A campaign: what was recorded and what is what, read and checked before any stage runs. Never written to."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
 from pipeline.campaign_schema import FORMAT, CampaignEntry, InstrumentEntry, StationCameraEntry, SurveyEntry
 from pipeline.instrument_frames import cell_frames
 from robcal.calibration.instruments import CellFrame
-from robcal.errors import InvalidInput
+from robcal.errors import InvalidInput, RobcalError
 from robcal.files.body_file import BodyFile, check_ring_codes, read_body
 from robcal.files.camera_file import CameraFile, read_camera
 from robcal.files.camera_import import split_choice
@@ -18,17 +20,20 @@ from robcal.files.measurement_tables import (
     MarksTable,
     MeasuredTable,
     check_marks,
-    read_marks,
-    read_measurements,
+    marks_of,
+    measurements_of,
     without_frozen,
 )
-from robcal.files.poses_table import Poses, read_poses
+from robcal.files.poses_table import Poses, poses_of
 from robcal.files.robot_import import read_any_robot
-from robcal.files.schemas import parse, proposal
+from robcal.files.schemas import parse, parse_leniently, proposal
+from robcal.files.tables import FaultyRows, Table, read_table
 from robcal.files.yaml_io import YamlDocument, read_yaml
 from robcal.physics.gravity_sag import without_masses
 from robcal.robot.chain import chain_of, forward
 from robcal.robot.model import RobotModel
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -149,37 +154,99 @@ def read_campaign(path: Path | str) -> Campaign:
     return _Reader(campaign_file(Path(path))).read()
 
 
+def read_leniently(path: Path | str) -> tuple[Campaign | None, list[str]]:
+    """What can be read of a campaign, and a sentence for every fault found in it; parts with faults are left out.
+
+    Where rows of the table of poses are faulty, ``poses`` lacks them, and measurements are those of all others.
+    """
+    faults: list[str] = []
+    campaign = None
+    try:
+        campaign = _Reader(campaign_file(Path(path)), faults).read()
+    except InvalidInput as error:
+        faults.extend(error.faults)
+    except RobcalError as error:
+        faults.append(str(error))
+    return campaign, list(dict.fromkeys(faults))
+
+
 class _Reader:
-    def __init__(self, path: Path) -> None:
+    """Reads a campaign; with a list of ``faults`` it notes them there and goes on, else it raises the first."""
+
+    def __init__(self, path: Path, faults: list[str] | None = None) -> None:
         self.path = path
+        self.faults = faults
         self.document = read_yaml(path)
-        self.entry = parse(self.document, CampaignEntry, FORMAT)
+        if faults is None:
+            self.entry = parse(self.document, CampaignEntry, FORMAT)
+        else:
+            entry, problems = parse_leniently(self.document, CampaignEntry, FORMAT)
+            if entry is None:
+                raise InvalidInput(problems[0], problems)
+            self.entry = entry
+            faults.extend(problems)
         self.notes: list[str] = []
         self.warnings: list[str] = []
+        self.pose_names: tuple[str, ...] = ()
         self.files: list[Path] = [path]
+
+    def _part(self, work: Callable[[], T]) -> T | None:
+        """A part of the campaign; where faults are noted, None if it has some."""
+        try:
+            return work()
+        except RobcalError as error:
+            if self.faults is None:
+                raise
+            self.faults.extend(error.faults if isinstance(error, InvalidInput) else [str(error)])
+        return None
+
+    def _rows(self, name: str, read: Callable[[Table], T]) -> T:
+        """What a table says; where faults are noted, what its sound rows say."""
+        try:
+            table = read_table(self._file(name))
+        except FaultyRows as error:
+            if self.faults is None:
+                raise
+            self.faults.extend(error.faults)
+            table = error.rest
+        while True:
+            try:
+                return read(table)
+            except FaultyRows as error:
+                if self.faults is None or not len(error.rest):
+                    raise
+                self.faults.extend(error.faults)
+                table = error.rest
+
+    def _poses(self, name: str, robot: RobotModel | None) -> Poses:
+        def read(table: Table) -> Poses:
+            if not self.pose_names and table.has("pose"):
+                self.pose_names = table.columns["pose"]
+            return poses_of(table, robot, robot.payloads if robot else ())
+
+        return self._rows(name, read)
 
     def read(self) -> Campaign:
         entry = self.entry
-        self._check_whole()
-        robot = self._robot()
-        bodies = {name: self._body(name) for name in entry.bodies}
+        if not self.faults:
+            self._check_whole()
+        robot = self._part(self._robot)
+        found = {name: self._part(partial(self._body, name)) for name in entry.bodies}
+        bodies = {name: body for name, body in found.items() if body is not None}
         poses = None
         if entry.poses is not None:
-            poses = read_poses(self._file(entry.poses), robot, robot.payloads if robot else ())
-            self.notes.extend(poses.notes)
+            poses = self._part(partial(self._poses, entry.poses, robot))
+            self.notes.extend(poses.notes if poses is not None else ())
         if robot is not None and entry.poses is not None and without_masses(robot):
             self.notes.append(
                 "the robot file states no masses (mass_kg, cog_mm): sag under the arm's own weight is identified where "
                 "the poses show it, but what another payload does to the arm cannot be predicted"
             )
-        cameras = self._station(poses)
-        if poses is None and entry.station is not None:
+        cameras = self._part(partial(self._station, poses)) or {}
+        if poses is None and entry.poses is None and entry.station is not None:
             poses = self._poses_from_images(cameras)
-        measurements = self._tables(entry.measurements, robot, poses)
-        for table in measurements:
-            self.warnings.extend(table.notes)
-            self._check_targets(table, bodies)
-        instruments = self._instruments(measurements, robot, poses, bodies)
+        measurements = self._tables(entry.measurements, robot, poses, bodies)
+        instruments = self._part(partial(self._instruments, measurements, robot, poses, bodies)) or {}
         return Campaign(
             path=self.path,
             entry=entry,
@@ -195,12 +262,26 @@ class _Reader:
             files=tuple(dict.fromkeys(self.files)),
         )
 
-    def _tables(self, names: Sequence[str], robot: RobotModel | None, poses: Poses | None) -> tuple[MeasuredTable, ...]:
-        tables = tuple(read_measurements(self._file(name), poses.names if poses else ()) for name in names)
-        if robot is None or poses is None:
-            return tables
-        places = forward(chain_of(robot), poses.q)[:, :3, 3]
-        return tuple(without_frozen(table, places, poses.names) for table in tables)
+    def _tables(
+        self, names: Sequence[str], robot: RobotModel | None, poses: Poses | None, bodies: Mapping[str, BodySource]
+    ) -> tuple[MeasuredTable, ...]:
+        known = poses.names if poses is not None else ()
+        sound = self.faults is None or known == self.pose_names
+        places = None
+        if robot is not None and poses is not None and sound and poses.q.shape[1]:
+            places = forward(chain_of(robot), poses.q)[:, :3, 3]
+
+        def read(table: Table) -> MeasuredTable:
+            found = measurements_of(table, known if sound else self.pose_names)
+            found = found if places is None else without_frozen(found, places, known)
+            self._check_targets(table, found, bodies)
+            return found
+
+        found = [self._part(partial(self._rows, name, read)) for name in names]
+        tables = tuple(table for table in found if table is not None)
+        for table in tables:
+            self.warnings.extend(table.notes)
+        return tables
 
     def _instruments(
         self,
@@ -225,15 +306,16 @@ class _Reader:
             if name in tables:
                 raise self._error(("instruments", name), f"'{name}' names two instruments: choose another name")
             try:
-                tables[name] = self._tables(use.measurements, robot, poses)
+                tables[name] = self._tables(use.measurements, robot, poses, bodies)
             except InvalidInput as error:
-                raise type(error)(f"instrument '{name}': {error}") from None
+                raise InvalidInput(f"instrument '{name}': {error}") from None
             for table in tables[name] or ():
-                self.warnings.extend(table.notes)
-                self._check_instrument(name, use, table, bodies)
+                self._part(partial(self._check_instrument, name, use, table, bodies))
         known = {n: (e.world_T_base, e.flange_T_tool) for n, e in entry.instruments.items()}
         try:
-            worlds, tools = cell_frames(list(tables), known, (entry.world_T_base, entry.flange_T_tool), entry)
+            alone = (entry.world_T_base, entry.flange_T_tool)
+            hands = [n for n, some in tables.items() if some and all(t.kind == "sensor_points" for t in some)]
+            worlds, tools = cell_frames(list(tables), known, alone, entry, hands)
         except InvalidInput as error:
             raise self._error(("instruments",), str(error)) from None
         return {
@@ -256,7 +338,6 @@ class _Reader:
                 ("instruments", name, "pulley"),
                 f"instrument '{name}' has {table.kind}: a pulley belongs to distances, and its axis needs a direction",
             )
-        self._check_targets(table, bodies)
 
     def _error(self, place: tuple[str | int, ...], message: str) -> InvalidInput:
         line = self.document.line(place)
@@ -332,7 +413,7 @@ class _Reader:
         if start is not None:
             size = (start.camera.width, start.camera.height)
         if entry.observations is not None:
-            marks = read_marks(self._file(entry.observations))
+            marks = self._rows(entry.observations, marks_of)
             check_marks(marks, size)
             return ImageSource({}, marks, start, start_path, size)
         folder = self._place(str(entry.images)).absolute()  # the report looks for them from anywhere
@@ -346,11 +427,16 @@ class _Reader:
             raise self._error(("station", "cameras"), "the station has no cameras: name at least one")
         cameras = {}
         for name, use in station.cameras.items():
-            source = self._source(use, use.calibration, ("station", "cameras", name), f"camera '{name}'")
-            if use.images is not None:
-                source = replace(source, images=self._by_stem(source.images, name))
-            cameras[name] = self._match_poses(source, name, poses)
+            source = self._part(partial(self._camera, name, use, poses))
+            if source is not None:
+                cameras[name] = source
         return cameras
+
+    def _camera(self, name: str, use: StationCameraEntry, poses: Poses | None) -> ImageSource:
+        source = self._source(use, use.calibration, ("station", "cameras", name), f"camera '{name}'")
+        if use.images is not None:
+            source = replace(source, images=self._by_stem(source.images, name))
+        return self._match_poses(source, name, poses)
 
     def _by_stem(self, images: Mapping[str, Path], camera: str) -> dict[str, Path]:
         stems: dict[str, Path] = {}
@@ -365,14 +451,16 @@ class _Reader:
     def _match_poses(self, source: ImageSource, camera: str, poses: Poses | None) -> ImageSource:
         if poses is None:
             return source
-        known = set(poses.names)
+        known = {*poses.names, *self.pose_names}
         if source.marks is not None:
-            for i, image in enumerate(source.marks.image):
-                if image not in known:
-                    raise InvalidInput(
-                        f"{source.marks.path}: image '{image}' is not a pose of {poses.path.name} (mark {i + 1}): for "
-                        "a station camera the image is the pose id"
-                    )
+            faults = [
+                f"{source.marks.path}: image '{image}' is not a pose of {poses.path.name} (mark "
+                f"{source.marks.image.index(image) + 1}): for a station camera the image is the pose id"
+                for image in dict.fromkeys(source.marks.image)
+                if image not in known
+            ]
+            if faults:
+                raise InvalidInput(faults[0], faults)
         strangers = [name for name in source.images if name not in known]
         if source.images and len(strangers) == len(source.images):
             path = source.images[strangers[0]]
@@ -397,14 +485,18 @@ class _Reader:
         none = np.zeros((n, 0))
         return Poses(names, none, (None,) * n, np.zeros(n, bool), none, path=self.path, rows=rows)
 
-    def _check_targets(self, table: MeasuredTable, bodies: Mapping[str, BodySource]) -> None:
-        if table.kind not in ("points", "sensor_points") or not bodies:
+    def _check_targets(self, table: Table, found: MeasuredTable, bodies: Mapping[str, BodySource]) -> None:
+        if found.kind not in ("points", "sensor_points") or not bodies or len(bodies) < len(self.entry.bodies):
             return
         listed = {t.id for body in bodies.values() for t in body.file.targets if t.id is not None}
-        surveyed = any(body.survey is not None for body in bodies.values())
-        for i, target in enumerate(table.target):
-            if int(target) not in listed and not surveyed:
-                raise InvalidInput(
-                    f"{table.path}, row {int(table.rows[i])}: target {int(target)} is in no body of the campaign"
-                    f"{proposal(str(int(target)), [str(t) for t in sorted(listed)])}: add it there or remove the row"
-                )
+        if any(body.survey is not None for body in bodies.values()):
+            return
+        known = [str(t) for t in sorted(listed)]
+        strange = np.isin(table.rows, found.rows[~np.isin(found.target, list(listed))])
+
+        def told(i: int) -> str:
+            target = table.columns["target"][i]
+            remedy = f"{proposal(target, known)}: add it there or remove the row"
+            return f"target {target} is in no body of the campaign{remedy}"
+
+        table.refuse(strange, told)

@@ -102,7 +102,7 @@ class QualityEntry(Entry):
 class ModelEntry(Entry):
     """Choices of the identification."""
 
-    parameters: Literal["standard", "geometry", "table5.4"] | list[Text] = "standard"
+    parameters: Literal["standard", "geometry", "table5.4", "none"] | list[Text] = "standard"
     objective: Literal["maximum_likelihood", "basis_norm"] = "maximum_likelihood"
     robust: bool = True
     statics: Literal["one_step", "converged"] = "converged"

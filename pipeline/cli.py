@@ -74,6 +74,27 @@ def run(
         LOG.info(f"results in {done.run.folder}")
 
 
+@app.command(short_help="All faults of a campaign at once, before any long work.")
+def check(campaign: CampaignPath, quiet: Quiet = False, as_json: Json = False) -> None:
+    """Look for everything that would stop a run, or is doubtful: a line each on standard output, with file and row.
+
+    Exit code 1 if anything would stop a run. Reads all files and looks into a few images; writes nothing.
+    """
+    with answers("check", as_json, quiet) as answer:
+        from pipeline.checking.check import check_campaign
+        from pipeline.checking.told import as_data, as_lines
+
+        found = check_campaign(campaign)
+        answer.update(as_data(found))
+        if not as_json:
+            for line in as_lines(found, quiet):
+                typer.echo(line)
+        if found.faults:
+            answer["ok"] = False
+    if answer["faults"]:
+        raise typer.Exit(1)
+
+
 @app.command()
 def survey(
     campaign: CampaignPath,
@@ -164,27 +185,15 @@ def compensate(
     if program not in (None, "krl", "rapid", "urscript"):
         wrong_use(f"--program is 'krl', 'rapid' or 'urscript', not '{program}'")
     with answers("compensate", as_json, quiet) as answer:
-        from pipeline.prediction import compensate_run
+        from pipeline.prediction import CompensateOptions, compensate_run
 
-        targets, in_base = kind == "frames", system == "base"
-        answer.update(
-            compensate_run(
-                run_folder,
-                frames,
-                out,
-                as_frames=targets,
-                in_base=in_base,
-                skip_unreachable=skip,
-                program=program,
-                instrument=instrument,
-                at_cycle=at_cycle,
-            )
-        )
+        options = CompensateOptions(kind == "frames", system == "base", skip, program, instrument, at_cycle)
+        answer.update(compensate_run(run_folder, frames, out, options))
         for sentence in answer["warnings"]:
             LOG.warning(sentence)
         remaining = answer["remaining_max_mm"]
-        told = f"at most {remaining:.2g} mm" if remaining >= 1e-4 else "below 0.0001 mm"
-        LOG.info(f"{answer['frames']} rows in {out}, remaining error {told}")
+        size = f"at most {remaining:.2g} mm" if remaining >= 1e-4 else "below 0.0001 mm"
+        LOG.info(f"{answer['frames']} rows in {out}, remaining error {size}")
 
 
 @app.command()

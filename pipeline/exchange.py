@@ -8,6 +8,7 @@ import numpy as np
 from pipeline.mastering import keep_calibrated, measured_campaign, recording_for
 from pipeline.runs import open_run
 from pipeline.stages.identify import load_calibrated, require_robot
+from pipeline.stages.survey import located
 from robcal.cell.exchange import exchange, transfer
 from robcal.errors import InvalidInput, NotIdentifiable
 from robcal.files.poses_table import joint_columns, read_poses
@@ -34,7 +35,7 @@ def exchange_robot(reference: Path, campaign_path: Path, out: Path, workers: int
     try:
         found = exchange(robot, nominal, log, recording)
     except (InvalidInput, NotIdentifiable) as error:
-        raise type(error)(f"{campaign.path}: {error}") from None
+        raise located(error, str(campaign.path)) from None
     keep_calibrated(run, found, f"exchanged for {robot.model.name}, from campaign {campaign.name}")
     joints = {f.name: f"{f.name}.{f.joint_kind}" for f in nominal.joints}
     values, sigma = found.values, dict(zip(found.names, found.sigma, strict=True))

@@ -1,6 +1,6 @@
 """Worlds and tools of a campaign's instruments, from what campaign.yaml states of them."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
@@ -15,13 +15,14 @@ Stated = tuple[CellFrameEntry | None, CellFrameEntry | None]
 
 
 def cell_frames(
-    names: Sequence[str], stated: Mapping[str, Stated], alone: Stated, entry: CampaignEntry
+    names: Sequence[str], stated: Mapping[str, Stated], alone: Stated, entry: CampaignEntry, hands: Collection[str] = ()
 ) -> tuple[dict[str, CellFrame], dict[str, CellFrame]]:
     """World and tool of every instrument by its name; those that share one have the very same.
 
     Parameters
     ----------
     stated : world_T_base and flange_T_tool of instruments. alone : those at the top level, for a single instrument.
+    hands : instruments in the robot's hand; the orientation of their tool is that of a certificate.
 
     Raises
     ------
@@ -38,14 +39,19 @@ def cell_frames(
                 raise InvalidInput(
                     f"{key}: {' and '.join(entries)} share a frame, and more than one of them states it: state it once"
                 )
-            frame = cell_frame(group[0], end, next(iter(entries.values()), None))
+            frame = cell_frame(
+                group[0], end, next(iter(entries.values()), None), end == "tool" and set(group) <= set(hands)
+            )
             frames.update(dict.fromkeys(group, frame))
         out.append(frames)
     return out[0], out[1]
 
 
-def cell_frame(name: str, end: str, entry: CellFrameEntry | None) -> CellFrame:
-    """What an entry says of a world ('base') or a tool; what it does not state is free."""
+def cell_frame(name: str, end: str, entry: CellFrameEntry | None, hand: bool = False) -> CellFrame:
+    """What an entry says of a world ('base') or a tool; what it does not state is free.
+
+    Angles of a sensor in the ``hand`` that are stated without more are those of a certificate: points hardly tell them.
+    """
     if entry is None:
         return CellFrame(name, end)
     places = np.full(3, np.nan) if entry.xyz_mm is None else np.array(entry.xyz_mm) / 1000.0
@@ -60,7 +66,10 @@ def cell_frame(name: str, end: str, entry: CellFrameEntry | None) -> CellFrame:
         named = isinstance(entry.free, list) or uncertain
         if held and (np.isfinite(given[k]) or named):
             sigma[k] = prior[k // 3]
-    return CellFrame(name, end, tuple(given.tolist()), tuple(sigma.tolist()))
+    certified = hand and entry.rpy_deg is not None and entry.free is None and entry.sigma_deg is None
+    if certified:
+        sigma[3:] = FIXED
+    return CellFrame(name, end, tuple(given.tolist()), tuple(sigma.tolist()), certified)
 
 
 def _groups(names: Sequence[str], groups: Sequence[Sequence[str]], key: str) -> list[list[str]]:

@@ -14,6 +14,7 @@ from pipeline.runner import run_campaign
 from pipeline.runs import Run, StageRecord, open_run
 from pipeline.stages.identify import load_calibrated, require_robot
 from pipeline.stages.observations import build_recording
+from pipeline.stages.survey import located
 from robcal.calibration.calibrated import CalibratedRobot
 from robcal.calibration.joint_log import JointLog
 from robcal.calibration.measurements import RobotRecording, Rows
@@ -47,7 +48,7 @@ def master_campaign(
     try:
         found = master(robot, log, recording.observations, joints=joints, free=free, stated=recording.stated)
     except (InvalidInput, NotIdentifiable) as error:
-        raise type(error)(f"{campaign.path}: {error}") from None
+        raise located(error, str(campaign.path)) from None
     data = mastering_data(found, robot.model)
     write_json(out / "mastering.json", data)
     keep_calibrated(run, found.robot, f"mastered from campaign {campaign.name}")

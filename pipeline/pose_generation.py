@@ -1,138 +1,32 @@
 """Command poses: a description of the cell (format robcal/poses-1) in, a table of measuring poses out."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
-from pydantic import Field
 
-from robcal.calibration.collision import Ball, Box, Capsule, HalfSpace, Obstacle, link_capsules
+from pipeline.pose_schema import FORMAT, PosesEntry, metres
+from robcal.calibration.collision import Capsule, Obstacle, link_capsules
 from robcal.calibration.pose_candidates import Cell
 from robcal.calibration.poses import PosePlan, PoseRequest
 from robcal.calibration.poses import generate_poses as plan_poses
+from robcal.calibration.sensor_poses import SensorRequest, sensor_poses
 from robcal.calibration.visibility import Viewpoint, VisibilityRules
 from robcal.errors import InvalidInput
 from robcal.files.body_file import body_from_file, read_body
 from robcal.files.camera_file import read_camera
 from robcal.files.poses_table import joint_columns
-from robcal.files.robot_file import PayloadEntry, PlacementEntry
 from robcal.files.robot_import import read_any_robot
-from robcal.files.schemas import Entry, NotNegative, Number, Positive, Text, Triple, Whole, read_entry
+from robcal.files.schemas import read_entry
 from robcal.files.tables import write_table
+from robcal.photogrammetry.core.bodies import Body, fit_sphere
 from robcal.robot.model import RobotModel
-from robcal.transforms import Array
+from robcal.transforms import Array, invert
 
-FORMAT = "robcal/poses-1"
-
-
-class BodyPart(Entry):
-    """What the robot carries to be measured."""
-
-    targets: Text
-    flange_T_body: PlacementEntry = PlacementEntry()
-    facing: Triple = (0.0, 0.0, 1.0)
-
-
-class VisibilityPart(Entry):
-    """When a pose counts as visible."""
-
-    cameras: Whole = 2
-    targets: Whole = 3
-    incidence_deg: Positive = 60.0
-    margin_px: NotNegative = 15.0
-    diameter_px: NotNegative = 5.0
-
-
-class CapsulePart(Entry):
-    """A link's hull: all points within the radius of a segment."""
-
-    frame: Text
-    start_mm: Triple = (0.0, 0.0, 0.0)
-    end_mm: Triple
-    radius_mm: Positive
-
-
-class ObstaclePart(Entry):
-    """A simple body in base coordinates."""
-
-    kind: Literal["floor", "box", "ball", "capsule"]
-    height_mm: Number | None = None
-    xyz_mm: Triple | None = None
-    rpy_deg: Triple = (0.0, 0.0, 0.0)
-    size_mm: tuple[Positive, Positive, Positive] | None = None
-    radius_mm: Positive | None = None
-    start_mm: Triple | None = None
-    end_mm: Triple | None = None
-
-    def obstacle(self, where: str) -> Obstacle:
-        """The body in SI units."""
-        needed = {
-            "floor": ("height_mm",),
-            "box": ("xyz_mm", "size_mm"),
-            "ball": ("xyz_mm", "radius_mm"),
-            "capsule": ("start_mm", "end_mm", "radius_mm"),
-        }[self.kind]
-        for key in needed:
-            if getattr(self, key) is None:
-                raise InvalidInput(f"{where}: a {self.kind} needs {', '.join(needed)}; {key} is missing")
-        if self.kind == "floor":
-            return HalfSpace((0.0, 0.0, 1.0), float(self.height_mm or 0.0) / 1000)
-        if self.kind == "box":
-            placement = PlacementEntry(xyz_mm=_given(self.xyz_mm), rpy_deg=self.rpy_deg)
-            return Box(placement.matrix(), _metres(_given(self.size_mm)))
-        radius = float(self.radius_mm or 0.0) / 1000
-        if self.kind == "ball":
-            return Ball(_metres(_given(self.xyz_mm)), radius)
-        return Capsule("base", _metres(_given(self.start_mm)), _metres(_given(self.end_mm)), radius)
-
-
-class CollisionPart(Entry):
-    """Links and surroundings."""
-
-    link_radius_mm: Positive | None = None
-    capsules: list[CapsulePart] = Field(default_factory=list)
-    clearance_mm: NotNegative = 20.0
-    obstacles: list[ObstaclePart] = Field(default_factory=list)
-
-
-class ChoicePart(Entry):
-    """How many poses and by what they are chosen."""
-
-    method: Literal["d_optimal", "worst_case", "equidistant"] = "d_optimal"
-    count: Whole = 80
-    accuracy_mm: Positive | None = None
-    verify: Whole = 0
-    parameters: Literal["standard", "geometry", "table5.4"] | list[Text] = "standard"
-    candidates: Whole = 800
-    range_margin: NotNegative = 0.02
-    seed: Whole = 0
-
-
-class MeasuringPart(Entry):
-    """Accuracy of the measurement: of an image point, and of a frame beside that."""
-
-    sigma_px: Positive = 0.05
-    sigma_mm: Positive = 0.05
-    sigma_deg: Positive = 0.006
-
-
-class PosesEntry(Entry):
-    """The whole file."""
-
-    format: Literal["robcal/poses-1"]
-    robot: Text
-    payloads: dict[str, PayloadEntry] = Field(default_factory=dict)
-    payload: Text | None = None
-    world_T_base: PlacementEntry = PlacementEntry()
-    body: BodyPart | None = None
-    cameras: dict[str, Text] = Field(default_factory=dict)
-    visibility: VisibilityPart = VisibilityPart()
-    collision: CollisionPart = CollisionPart()
-    choice: ChoicePart = ChoicePart()
-    measuring: MeasuringPart = MeasuringPart()
-    test_points_mm: list[Triple] = Field(default_factory=lambda: [(0.0, 0.0, 0.0), (200.0, 200.0, 400.0)])
-    start: list[Number] | None = None
+RADIUS_TOLERANCE = 1e-3
+"""m; targets of a sphere may be on another radius than stated by this, for want of care in the file."""
 
 
 def generate_poses(config: Path, out: Path) -> dict[str, Any]:
@@ -142,6 +36,8 @@ def generate_poses(config: Path, out: Path) -> dict[str, Any]:
     ------
     InvalidInput : the description contradicts itself, or no pose of the cell can be measured.
     """
+    if read_entry(config, PosesEntry, FORMAT)[0].sensor is not None:
+        return _generate_sensor_poses(config, out)
     request = read_request(config)
     try:
         plan = plan_poses(request)
@@ -179,26 +75,8 @@ def read_request(config: Path) -> PoseRequest:
     InvalidInput : the file, or one that it names, contradicts the contract.
     """
     entry, _ = read_entry(config, PosesEntry, FORMAT)
-    folder = config.parent
-    model = read_any_robot(folder / entry.robot)
-    payloads = {**model.payloads, **{name: p.payload() for name, p in entry.payloads.items()}}
-    model = RobotModel(
-        model.name,
-        model.frames,
-        model.gravity,
-        model.gravity_frame,
-        model.parameters,
-        model.terms,
-        payloads,
-        model.world_T_base,
-        model.flange_T_tool,
-    )
+    model = _robot(entry, config)
     choice, measuring = entry.choice, entry.measuring
-    start = None
-    if entry.start is not None:
-        if len(entry.start) != model.n_joints:
-            raise InvalidInput(f"{config}: start has {len(entry.start)} values, the robot {model.n_joints} joints")
-        start = np.array([v * factor for v, (_, factor) in zip(entry.start, joint_columns(model), strict=True)])
     parameters = choice.parameters if isinstance(choice.parameters, str) else tuple(choice.parameters)
     return PoseRequest(
         model=model,
@@ -211,12 +89,124 @@ def read_request(config: Path) -> PoseRequest:
         payload=entry.payload,
         sigma_px=measuring.sigma_px,
         sigma=(measuring.sigma_mm / 1000, float(np.deg2rad(measuring.sigma_deg))),
-        test_points=tuple(_metres(p) for p in entry.test_points_mm),
+        test_points=tuple(metres(p) for p in entry.test_points_mm),
         candidates=choice.candidates,
         margin=choice.range_margin,
         seed=choice.seed,
-        start=start,
+        start=_start(entry, config, model),
     )
+
+
+def read_sensor_request(config: Path) -> SensorRequest:
+    """What a file with a ``sensor`` asks for; a calibrated robot's file gives frames that are not stated.
+
+    Raises
+    ------
+    InvalidInput : the file, or one that it names, contradicts the contract.
+    """
+    entry, _ = read_entry(config, PosesEntry, FORMAT)
+    sensor = entry.sensor
+    if sensor is None or entry.body is None:
+        raise InvalidInput(f"{config}: a sensor looks at the targets of a body: name it, 'body: sphere.yaml'")
+    if entry.cameras:
+        raise InvalidInput(f"{config}: cameras and a sensor in the hand are two ways of measuring: keep one of them")
+    if sensor.cone_deg >= 60:
+        raise InvalidInput(f"{config}: sensor.cone_deg is {sensor.cone_deg:g}: half an opening is below 60 degrees")
+    model, choice = _robot(entry, config), entry.choice
+    frames: dict[str, Array] = {}
+    for key, stated, known in (
+        ("base_T_body", entry.base_T_body, None if model.world_T_base is None else invert(model.world_T_base)),
+        ("sensor.flange_T_sensor", sensor.flange_T_sensor, model.flange_T_tool),
+    ):
+        if stated is None and known is None:
+            raise InvalidInput(f"{config}: {key} is missing, and {entry.robot} is no calibrated robot that has it")
+        frames[key] = stated.matrix() if stated is not None else np.asarray(known)
+    file = read_body(config.parent / entry.body.targets)
+    body = body_from_file(Path(entry.body.targets).stem, file)
+    _check_radius(body, file.radius, file.path)
+    capsules, obstacles = _bodies(entry, config, model)
+    return SensorRequest(
+        model=model,
+        body=body,
+        base_T_body=frames["base_T_body"],
+        flange_T_sensor=frames["sensor.flange_T_sensor"],
+        distance=sensor.distance_mm / 1000,
+        cone=float(np.deg2rad(sensor.cone_deg)),
+        count=choice.count,
+        verify=choice.verify,
+        payload=_payload(entry, config, model),
+        capsules=capsules,
+        obstacles=obstacles,
+        clearance=entry.collision.clearance_mm / 1000,
+        margin=choice.range_margin,
+        start=_start(entry, config, model),
+    )
+
+
+def _generate_sensor_poses(config: Path, out: Path) -> dict[str, Any]:
+    request = read_sensor_request(config)
+    try:
+        plan = sensor_poses(request)
+    except InvalidInput as problem:
+        raise InvalidInput(f"{config}: {problem}") from problem
+    names = [f"p{k:03d}" for k in range(1, len(plan.q) + 1)]
+    columns: dict[str, Sequence[object]] = {"pose": names, **_joints(request.model, plan.q)}
+    columns["target"] = plan.target.tolist()
+    columns["turn_deg"] = [f"{v:.3f}" for v in np.degrees(plan.turn)]
+    if request.payload is not None:
+        columns["payload"] = [request.payload] * len(names)
+    columns["set"] = ["verify" if v else "identify" for v in plan.verify]
+    write_table(out, columns)
+    warnings = []
+    for reason in dict.fromkeys(plan.unreachable.values()):
+        ids = ", ".join(str(k) for k, other in plan.unreachable.items() if other == reason)
+        warnings.append(f"{config}: no pose looks at target {ids}: {reason}")
+    if plan.blocked:
+        told = ", ".join(names[k] for k in plan.blocked)
+        warnings.append(f"{config}: the straight move to {told} collides: lead the robot there by points of your own")
+    if len(names) < request.count + request.verify:
+        warnings.append(f"{config}: {request.count + request.verify} poses are wanted, the robot has {len(names)}")
+    return {
+        "poses": len(names),
+        "verify": int(np.sum(plan.verify)),
+        "targets": len(np.unique(plan.target)),
+        "unreachable": [{"target": k, "reason": reason} for k, reason in plan.unreachable.items()],
+        "travel": plan.travel,
+        "out": str(out),
+        "warnings": warnings,
+    }
+
+
+def _check_radius(body: Body, radius: float | None, path: Path) -> None:
+    """Raise where the targets are on another sphere than the file states."""
+    try:
+        found = fit_sphere(body.points[body.known])[1]
+    except InvalidInput as problem:
+        raise InvalidInput(f"{path}: {problem}") from None
+    if radius is not None and abs(found - radius) > RADIUS_TOLERANCE:
+        raise InvalidInput(
+            f"{path}: shape states a radius of {1e3 * radius:g} mm, the targets are on one of {1e3 * found:.2f} mm: "
+            "correct the radius or the coordinates"
+        )
+
+
+def _robot(entry: PosesEntry, config: Path) -> RobotModel:
+    model = read_any_robot(config.parent / entry.robot)
+    return replace(model, payloads={**model.payloads, **{name: p.payload() for name, p in entry.payloads.items()}})
+
+
+def _payload(entry: PosesEntry, config: Path, model: RobotModel) -> str | None:
+    if entry.payload is not None and entry.payload not in model.payloads:
+        raise InvalidInput(f"{config}: the robot has no payload '{entry.payload}': list it under payloads")
+    return entry.payload
+
+
+def _start(entry: PosesEntry, config: Path, model: RobotModel) -> Array | None:
+    if entry.start is None:
+        return None
+    if len(entry.start) != model.n_joints:
+        raise InvalidInput(f"{config}: start has {len(entry.start)} values, the robot {model.n_joints} joints")
+    return np.array([v * factor for v, (_, factor) in zip(entry.start, joint_columns(model), strict=True)])
 
 
 def _cell(entry: PosesEntry, config: Path, model: RobotModel) -> Cell:
@@ -239,14 +229,7 @@ def _cell(entry: PosesEntry, config: Path, model: RobotModel) -> Cell:
     rules = entry.visibility
     if views and rules.cameras > len(views):
         raise InvalidInput(f"{config}: visibility.cameras asks for {rules.cameras} cameras, {len(views)} are given")
-    collision = entry.collision
-    radius = None if collision.link_radius_mm is None else collision.link_radius_mm / 1000
-    capsules = tuple(
-        Capsule(c.frame, _metres(c.start_mm), _metres(c.end_mm), c.radius_mm / 1000) for c in collision.capsules
-    )
-    obstacles = tuple(
-        o.obstacle(f"{config}: collision.obstacles[{k}]") for k, o in enumerate(collision.obstacles, start=1)
-    )
+    capsules, obstacles = _bodies(entry, config, model)
     return Cell(
         world_T_base=entry.world_T_base.matrix(),
         flange_T_body=flange_T_body,
@@ -260,10 +243,23 @@ def _cell(entry: PosesEntry, config: Path, model: RobotModel) -> Cell:
             diameter_px=rules.diameter_px,
             facing=facing,
         ),
-        capsules=capsules or link_capsules(model, radius),
+        capsules=capsules,
         obstacles=obstacles,
-        clearance=collision.clearance_mm / 1000,
+        clearance=entry.collision.clearance_mm / 1000,
     )
+
+
+def _bodies(entry: PosesEntry, config: Path, model: RobotModel) -> tuple[tuple[Capsule, ...], tuple[Obstacle, ...]]:
+    """Hulls of the links and what stands around them."""
+    collision = entry.collision
+    radius = None if collision.link_radius_mm is None else collision.link_radius_mm / 1000
+    capsules = tuple(
+        Capsule(c.frame, metres(c.start_mm), metres(c.end_mm), c.radius_mm / 1000) for c in collision.capsules
+    )
+    obstacles = tuple(
+        o.obstacle(f"{config}: collision.obstacles[{k}]") for k, o in enumerate(collision.obstacles, start=1)
+    )
+    return capsules or link_capsules(model, radius), obstacles
 
 
 def _columns(request: PoseRequest, plan: PosePlan, names: Sequence[str]) -> dict[str, Sequence[object]]:
@@ -291,12 +287,3 @@ def _path_columns(model: RobotModel, plan: PosePlan, names: Sequence[str]) -> di
 
 def _joints(model: RobotModel, q: Array) -> dict[str, Sequence[object]]:
     return {name: [f"{v:.6f}" for v in q[:, k] / factor] for k, (name, factor) in enumerate(joint_columns(model))}
-
-
-def _metres(values: Sequence[float]) -> tuple[float, float, float]:
-    x, y, z = (float(v) / 1000 for v in values)
-    return x, y, z
-
-
-def _given(values: tuple[float, float, float] | None) -> tuple[float, float, float]:
-    return (0.0, 0.0, 0.0) if values is None else values

@@ -8,12 +8,13 @@ from typing import Any
 import numpy as np
 
 from pipeline.robot_in_force import robot_in_force
+from robcal.calibration.calibrated import CalibratedRobot
 from robcal.errors import InvalidInput
 from robcal.files.frame_tables import SIX, frame_columns, sigma_columns
 from robcal.files.poses_table import joint_columns, parse_payload, read_poses
 from robcal.files.storage import write_text
 from robcal.files.tables import read_table, write_table
-from robcal.robot.compensation import cell_frames, compensate
+from robcal.robot.compensation import Compensation, cell_frames, compensate
 from robcal.robot.export.controller_formats import frame_program, joint_program, program_name
 from robcal.transforms import Array, frame_from_xyzrpy, invert
 
@@ -75,17 +76,27 @@ def read_wanted(path: Path, payloads: Collection[str]) -> WantedFrames:
     return WantedFrames(names, frame_from_xyzrpy(six), parse_payload(table, payloads), covariates)
 
 
+@dataclass(frozen=True)
+class CompensateOptions:
+    """What is to be written, and for which frames.
+
+    Attributes
+    ----------
+    as_frames : targets F* in place of joint angles. in_base : the wanted frames are given in the robot's base.
+    skip_unreachable : leave frames out that the robot cannot reach. program : controller to write a program for.
+    instrument, at_cycle : which robot; see :func:`pipeline.robot_in_force.robot_in_force`.
+    """
+
+    as_frames: bool = False
+    in_base: bool = False
+    skip_unreachable: bool = False
+    program: str | None = None
+    instrument: str | None = None
+    at_cycle: int | None = None
+
+
 def compensate_run(
-    folder: Path,
-    frames: Path,
-    out: Path,
-    *,
-    as_frames: bool = False,
-    in_base: bool = False,
-    skip_unreachable: bool = False,
-    program: str | None = None,
-    instrument: str | None = None,
-    at_cycle: int | None = None,
+    folder: Path, frames: Path, out: Path, options: CompensateOptions = CompensateOptions()
 ) -> dict[str, Any]:
     """Write the commands that bring the real tool to the wanted frames: a table, or a ``program`` of a controller.
 
@@ -93,56 +104,32 @@ def compensate_run(
     ------
     InvalidInput : no calibrated robot in the run, a bad table, or a frame that the robot cannot reach.
     """
-    calibrated = robot_in_force(folder, at_cycle, instrument)
-    model = calibrated.model
-    wanted = read_wanted(frames, model.payloads)
+    calibrated = robot_in_force(folder, options.at_cycle, options.instrument)
+    wanted = read_wanted(frames, calibrated.model.payloads)
     covariates = {name: np.full(len(wanted.T), value) for name, value in calibrated.defaults.items()}
-    covariates.update(wanted.covariates)
+    in_world = cell_frames(calibrated.kernel)[0] @ wanted.T if options.in_base else wanted.T
     result = compensate(
         calibrated.kernel,
         wanted.T,
         payload=wanted.payload,
-        covariates=covariates,
-        near=calibrated.nearest_recorded(cell_frames(calibrated.kernel)[0] @ wanted.T if in_base else wanted.T),
-        frame="base" if in_base else "world",
+        covariates={**covariates, **wanted.covariates},
+        near=calibrated.nearest_recorded(in_world),
+        frame="base" if options.in_base else "world",
     )
     unreachable = np.flatnonzero(~result.reachable)
-    if len(unreachable) and (not skip_unreachable or len(unreachable) == len(wanted.T)):
-        i = int(unreachable[0])
-        count = f" ({len(unreachable)} of {len(wanted.T)} frames)" if len(unreachable) > 1 else ""
-        raise InvalidInput(
-            f"{frames}: the robot cannot reach frame '{wanted.names[i]}'{count}: {result.reason[i]}: move the frame, "
-            "check --in (coordinates) and the payload, or leave such frames out with --skip-unreachable"
-        )
+    if len(unreachable) and (not options.skip_unreachable or len(unreachable) == len(wanted.T)):
+        raise _unreachable(frames, wanted, result)
     rows = np.flatnonzero(result.reachable)
     warnings = [f"{frames}: frame '{wanted.names[i]}' left out: {result.reason[i]}" for i in unreachable]
     missed = [wanted.names[i] for i in rows if not result.converged[i]]
     warnings += [f"{frames}: frame '{name}' is met only approximately (near a singular pose?)" for name in missed]
-    if program is not None:
-        name, q = program_name(out.stem), result.q[rows]
-        if as_frames:
-            # the program makes the robot's base the active one, whatever the wanted frames were given in
-            world_T_base, tool = cell_frames(calibrated.kernel)
-            targets = result.F_star[rows] if in_base else invert(world_T_base) @ result.F_star[rows]
-            text = frame_program(targets, program, name, tool, model=model, q=q)
-            load = "the tool data 'tool_robcal' hold 1 kg" if program == "rapid" else "the tool is set without its load"
-            warnings.append(f"{out}: {load}: give the controller the real load data")
-            if not in_base:
-                warnings.append(
-                    f"{frames}: read in the measuring system's coordinates, not in the robot's base (--in base); the "
-                    "program's targets are converted to base coordinates"
-                )
-        else:
-            text = joint_program(model, q, program, name)
-        write_text(out, text)
+    if options.program is None:
+        write_table(out, _command_columns(calibrated, wanted, result, options.as_frames))
+    elif options.as_frames:
+        write_text(out, _frame_program(calibrated, result, options.program, program_name(out.stem), options.in_base))
+        warnings += _program_warnings(frames, out, options)
     else:
-        columns: dict[str, Sequence[object]] = {"pose": [wanted.names[i] for i in rows]}
-        if as_frames:
-            columns.update(frame_columns(result.F_star[rows]))
-        else:
-            for k, (name, factor) in enumerate(joint_columns(model)):
-                columns[name] = [f"{v:.9f}" for v in result.q[rows, k] / factor]
-        write_table(out, columns)
+        write_text(out, joint_program(calibrated.model, result.q[rows], options.program, program_name(out.stem)))
     remaining = np.linalg.norm(result.remaining[rows, :3], axis=1) * 1000
     before = np.linalg.norm(result.before[rows, :3], axis=1) * 1000
     return {
@@ -153,3 +140,44 @@ def compensate_run(
         "uncompensated_mean_mm": float(np.nanmean(before)),
         "warnings": warnings,
     }
+
+
+def _unreachable(frames: Path, wanted: WantedFrames, result: Compensation) -> InvalidInput:
+    bad = np.flatnonzero(~result.reachable)
+    count = f" ({len(bad)} of {len(wanted.T)} frames)" if len(bad) > 1 else ""
+    return InvalidInput(
+        f"{frames}: the robot cannot reach frame '{wanted.names[bad[0]]}'{count}: {result.reason[bad[0]]}: move the "
+        "frame, check --in (coordinates) and the payload, or leave such frames out with --skip-unreachable"
+    )
+
+
+def _command_columns(
+    calibrated: CalibratedRobot, wanted: WantedFrames, result: Compensation, as_frames: bool
+) -> dict[str, Sequence[object]]:
+    """The reachable frames as a table of targets or of joint angles."""
+    rows = np.flatnonzero(result.reachable)
+    columns: dict[str, Sequence[object]] = {"pose": [wanted.names[i] for i in rows]}
+    if as_frames:
+        return columns | frame_columns(result.F_star[rows])
+    for k, (name, factor) in enumerate(joint_columns(calibrated.model)):
+        columns[name] = [f"{v:.9f}" for v in result.q[rows, k] / factor]
+    return columns
+
+
+def _frame_program(calibrated: CalibratedRobot, result: Compensation, program: str, name: str, in_base: bool) -> str:
+    """A program of targets; it makes the robot's base the active one, whatever the wanted frames were given in."""
+    rows = np.flatnonzero(result.reachable)
+    world_T_base, tool = cell_frames(calibrated.kernel)
+    targets = result.F_star[rows] if in_base else invert(world_T_base) @ result.F_star[rows]
+    return frame_program(targets, program, name, tool, model=calibrated.model, q=result.q[rows])
+
+
+def _program_warnings(frames: Path, out: Path, options: CompensateOptions) -> list[str]:
+    load = "the tool data 'tool_robcal' hold 1 kg" if options.program == "rapid" else "the tool is set without its load"
+    warnings = [f"{out}: {load}: give the controller the real load data"]
+    if not options.in_base:
+        warnings.append(
+            f"{frames}: read in the measuring system's coordinates, not in the robot's base (--in base); the "
+            "program's targets are converted to base coordinates"
+        )
+    return warnings

@@ -8,7 +8,16 @@ class RobcalError(Exception):
 
 
 class InvalidInput(RobcalError):
-    """Data or settings that contradict their format: a NaN, a wrong unit, an unknown name."""
+    """Data or settings that contradict their format: a NaN, a wrong unit, an unknown name.
+
+    Attributes
+    ----------
+    faults : a sentence for each fault, where a reader found several at once; the error's text is the first.
+    """
+
+    def __init__(self, message: str, faults: Iterable[str] = ()) -> None:
+        super().__init__(message)
+        self.faults: tuple[str, ...] = tuple(faults) or (message,)
 
 
 class DegenerateGeometry(RobcalError):

@@ -17,6 +17,7 @@ from robcal.files.tables import Table, read_table
 from robcal.robot.kernel import Kernel
 
 MOST_MM = 5000.0
+_REQUIRED = ("cycle", "time_s", "pose", "target", "x_mm", "y_mm", "z_mm")
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ def read_readings(
     InvalidInput : missing columns, a measurement twice, impossible numbers, a pose without joint angles.
     """
     table = read_table(path)
-    table.require(["cycle", "time_s", "pose", "target", "x_mm", "y_mm", "z_mm"])
+    table.require(_REQUIRED)
     if not len(table):
         raise InvalidInput(f"{path}: lists no readings")
     table.unique(["cycle", "pose", "target"])
@@ -54,27 +55,14 @@ def read_readings(
     time = table.numbers("time_s")
     pose = table.texts("pose")
     x = np.column_stack([table.numbers(f"{k}_mm") for k in "xyz"]) / 1000
-    far = np.abs(x).max(axis=1) > min(MOST_MM / 1000, MAX_METRES)
-    if far.any():
-        i = int(np.argmax(far))
-        raise table.error(i, f"a target {np.abs(x[i]).max():.3g} m off the sensor: coordinates are in mm")
+    _check_distance(table, x)
     stated = point_covariance(table)
     covariance = np.broadcast_to(sigma**2 * np.eye(3), (len(table), 3, 3)) if stated is None else stated
     q = _angles(table, robot, pose, angles)
     loads = list(parse_payload(table, robot.model.payloads))
     if "payload" not in table.columns:
         loads = [payload.get(name) for name in pose]
-    known = {
-        "cycle",
-        "time_s",
-        "pose",
-        "target",
-        "x_mm",
-        "y_mm",
-        "z_mm",
-        "payload",
-        *(n for n, _ in joint_columns(robot.model)),
-    }
+    known = {*_REQUIRED, "payload", *(n for n, _ in joint_columns(robot.model))}
     others = {
         name: column
         for name in table.columns
@@ -92,6 +80,13 @@ def read_readings(
         for i in range(len(table))
     )
     return ReadingsTable(table, made(kernel, robot, cycle, time, pose, target, content), content)
+
+
+def _check_distance(table: Table, x: np.ndarray) -> None:
+    far = np.abs(x).max(axis=1) > min(MOST_MM / 1000, MAX_METRES)
+    if far.any():
+        i = int(np.argmax(far))
+        raise table.error(i, f"a target {np.abs(x[i]).max():.3g} m off the sensor: coordinates are in mm")
 
 
 def made(

@@ -27,7 +27,7 @@ def evidence_figure(evidence: CauseEvidence, cause: str) -> Figure:
         for out, symbol, name in ((False, "circle", "single pose"), (True, "diamond-open", "kept-out pose")):
             mine = which & (evidence.kept_out == out)
             if mine.any():
-                data.append(_points(evidence, mine, x, factor, colour, symbol, f"{name}{told}", unit))
+                data.append(_points(evidence, mine, x, factor, (colour, symbol), f"{name}{told}", unit))
         means = _means(x[which], evidence.measured[which] * factor, evidence.sigma[which] * factor)
         if means is not None:
             data.append(
@@ -91,8 +91,9 @@ def abscissa(name: str, values: Array) -> tuple[Array, str]:
 
 
 def _points(
-    e: CauseEvidence, mine: Array, x: Array, factor: float, colour: str, symbol: str, name: str, unit: str
+    e: CauseEvidence, mine: Array, x: Array, factor: float, style: tuple[str, str], name: str, unit: str
 ) -> dict[str, Any]:
+    colour, symbol = style
     return trace(
         "scatter markers",
         (rounded(x[mine]), rounded(e.measured[mine] * factor)),

@@ -166,23 +166,12 @@ def _vectors(name: str, xy: Array, residual: Array, size: tuple[int, int]) -> Fi
     if len(rows) > MOST_ARROWS:
         rows = np.sort(np.random.default_rng(0).choice(rows, MOST_ARROWS, replace=False))
     tips = xy[rows] + magnification * residual[rows]
-    x: list[float | None] = []
-    y: list[float | None] = []
-    for a, b in zip(xy[rows], tips, strict=True):
-        x += [round(float(a[0]), 1), round(float(b[0]), 1), None]
-        y += [round(float(a[1]), 1), round(float(b[1]), 1), None]
     centres, means, counts = _field(xy, residual, size)
-    ax: list[float | None] = []
-    ay: list[float | None] = []
-    for a, m in zip(centres, means, strict=True):
-        b = a + 2 * magnification * m
-        ax += [round(float(a[0]), 1), round(float(b[0]), 1), None]
-        ay += [round(float(a[1]), 1), round(float(b[1]), 1), None]
     told = [f"{c} marks, mean {number(m[0], 2)}, {number(m[1], 2)} px" for c, m in zip(counts, means, strict=True)]
     data: tuple[Mapping[str, object], ...] = (
         trace(
             "scatter lines",
-            (x, y),
+            _arrows(xy[rows], tips),
             f"residuals x {magnification:g}",
             line={"color": GREY, "width": 1},
             hoverinfo="skip",
@@ -190,7 +179,7 @@ def _vectors(name: str, xy: Array, residual: Array, size: tuple[int, int]) -> Fi
         ),
         trace(
             "scatter lines",
-            (ax, ay),
+            _arrows(centres, centres + 2 * magnification * means),
             f"mean of a region x {2 * magnification:g}",
             line={"color": AFTER, "width": 3},
             hoverinfo="skip",
@@ -220,6 +209,13 @@ def _vectors(name: str, xy: Array, residual: Array, size: tuple[int, int]) -> Fi
         height=460,
         wide=False,
     )
+
+
+def _arrows(starts: Array, tips: Array) -> tuple[list[float | None], list[float | None]]:
+    """x and y of lines from starts to tips, with a gap after each."""
+    ends = np.round(np.stack([starts, tips], axis=1), 1).tolist()
+    x, y = ([v for pair in ends for v in (pair[0][k], pair[1][k], None)] for k in range(2))
+    return x, y
 
 
 def _field(xy: Array, residual: Array, size: tuple[int, int], across: int = 8) -> tuple[Array, Array, list[int]]:

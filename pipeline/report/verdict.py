@@ -1,6 +1,7 @@
 """The top of the report: one verdict a person can act on."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,9 @@ from pipeline.report.style import number, percent, probability
 from pipeline.report.verification_chapter import error_table, noise_by_tool
 from robcal.calibration.observations import FrameObservations
 from robcal.calibration.verification import Verification
+from robcal.photogrammetry.measure.frames import MeasuredFrames
+from robcal.photogrammetry.station.network import StationOrientation
+from robcal.photogrammetry.survey.types import SurveyResult
 from robcal.physics.library import kinds
 
 LEVEL = 0.01
@@ -168,71 +172,82 @@ def _sentence(parts: list[str]) -> str:
     return f"{text[:1].upper()}{text[1:]}."
 
 
-def _measuring(material: Material) -> Verdict:
+_WORDS: Mapping[Grade, str] = {"good": "Good", "care": "Usable, with care", "bad": "Not usable"}
+
+
+@dataclass
+class _Judged:
+    """A verdict while it is collected."""
+
     grade: Grade = "good"
-    parts, reasons, keys = [], [], []
+    parts: list[str] = field(default_factory=list)
+    reasons: list[str] = field(default_factory=list)
+    keys: list[KeyFigure] = field(default_factory=list)
+
+    def care(self, why: str) -> None:
+        """A doubt, which makes a good verdict one with care."""
+        self.grade = "care" if self.grade == "good" else self.grade
+        self.parts.append(why)
+
+
+def _measuring(material: Material) -> Verdict:
+    judged = _Judged()
     for name, survey in material.surveys.items():
-        n = survey.network
-        sigma = float(np.sqrt(np.mean(n.points_sigma**2)) * 1e3)
-        parts.append(f"{len(n.ids)} targets of {name} are known to {number(sigma)} mm from {len(n.image_names)} images")
-        keys += [
-            KeyFigure(number(sigma), "mm", f"Sigma of a coordinate, {name}", f"{len(n.ids)} targets"),
-            KeyFigure(number(n.sigma0_px), "px", "Sigma0 of a mark", f"redundancy {n.redundancy_total}"),
-        ]
-        if n.check_lengths:
-            worst = max(n.check_lengths, key=lambda c: abs(c.error))
-            keys.append(
-                KeyFigure(
-                    number(abs(worst.error) * 1e3),
-                    "mm",
-                    "Length error, VDI/VDE 2634-1",
-                    f"largest of {len(n.check_lengths)} check lengths",
-                )
-            )
-            reasons.append(f"{len(n.check_lengths)} check lengths took no part in the adjustment")
-            if any(abs(c.w) > 3.3 for c in n.check_lengths):
-                grade = "care"
-                parts.append("but check lengths deviate by more than their sigma allows")
-        else:
-            reasons.append(f"redundancy {n.redundancy_total}; no check length tests the scale of {name}")
-    station = material.station
-    if station is not None:
-        oriented = f"{len(station.names)} cameras are oriented from {len(station.poses)} poses"
-        frames = material.frames
-        if frames is not None and len(frames.pose):
-            own = np.sqrt(np.median(np.trace(frames.covariance[:, :3, :3], axis1=1, axis2=2)) / 3) * 1e3
-            oriented += f" and measure the body's place to {number(own)} mm"
-            count = f"median of {len(frames.pose)} poses"
-            keys.append(KeyFigure(number(own), "mm", "Sigma of a measured place", count))
-            deviation = np.abs(frames.pairs.deviation) * 1e3
-            if len(deviation):
-                keys.append(
-                    KeyFigure(
-                        number(deviation.mean()),
-                        "mm",
-                        "Deviation of lengths between targets",
-                        f"largest {number(deviation.max())} mm of {len(deviation)}",
-                    )
-                )
-        parts.append(oriented)
-        keys.append(KeyFigure(number(station.rms_px), "px", "Residuals of the station", "RMS"))
-        reasons.append(f"redundancy {station.redundancy_total:.0f} of the station, sigma0 {number(station.sigma0)}")
-        if not station.converged:
-            grade = "bad"
-            parts.append("but the station's adjustment did not converge")
+        _judge_survey(judged, name, survey)
+    if material.station is not None:
+        _judge_station(judged, material.station, material.frames)
     diagnosis = material.diagnosis or {}
     left = (diagnosis.get("unexplained") or {}).get("p_value")
     if (left is not None and left < LEVEL) or not_named(diagnosis):
-        grade = "care" if grade == "good" else grade
-        parts.append("but the images show something that the camera model does not explain")
-    word = {"good": "Good", "care": "Usable, with care", "bad": "Not usable"}.get(grade, "")
+        judged.care("but the images show something that the camera model does not explain")
     return Verdict(
-        grade,
-        word,
-        _sentence(parts),
-        _sentence(reasons),
+        judged.grade,
+        _WORDS.get(judged.grade, ""),
+        _sentence(judged.parts),
+        _sentence(judged.reasons),
         ("bodies/*.yaml (surveyed coordinates with sigmas) and " if material.surveys else "")
         + "cameras/*.yaml (calibrated cameras).",
         told_diagnosis(material),
-        tuple(keys),
+        tuple(judged.keys),
     )
+
+
+def _judge_survey(judged: _Judged, name: str, survey: SurveyResult) -> None:
+    n = survey.network
+    sigma = number(float(np.sqrt(np.mean(n.points_sigma**2)) * 1e3))
+    judged.parts.append(f"{len(n.ids)} targets of {name} are known to {sigma} mm from {len(n.image_names)} images")
+    judged.keys += [
+        KeyFigure(sigma, "mm", f"Sigma of a coordinate, {name}", f"{len(n.ids)} targets"),
+        KeyFigure(number(n.sigma0_px), "px", "Sigma0 of a mark", f"redundancy {n.redundancy_total}"),
+    ]
+    checked = n.check_lengths
+    if not checked:
+        judged.reasons.append(f"redundancy {n.redundancy_total}; no check length tests the scale of {name}")
+        return
+    worst = number(max(abs(c.error) for c in checked) * 1e3)
+    judged.keys.append(
+        KeyFigure(worst, "mm", "Length error, VDI/VDE 2634-1", f"largest of {len(checked)} check lengths")
+    )
+    judged.reasons.append(f"{len(checked)} check lengths took no part in the adjustment")
+    if any(abs(c.w) > 3.3 for c in checked):
+        judged.care("but check lengths deviate by more than their sigma allows")
+
+
+def _judge_station(judged: _Judged, station: StationOrientation, frames: MeasuredFrames | None) -> None:
+    oriented = f"{len(station.names)} cameras are oriented from {len(station.poses)} poses"
+    if frames is not None and len(frames.pose):
+        own = number(np.sqrt(np.median(np.trace(frames.covariance[:, :3, :3], axis1=1, axis2=2)) / 3) * 1e3)
+        oriented += f" and measure the body's place to {own} mm"
+        judged.keys.append(KeyFigure(own, "mm", "Sigma of a measured place", f"median of {len(frames.pose)} poses"))
+        deviation = np.abs(frames.pairs.deviation) * 1e3
+        if len(deviation):
+            largest = f"largest {number(deviation.max())} mm of {len(deviation)}"
+            judged.keys.append(
+                KeyFigure(number(deviation.mean()), "mm", "Deviation of lengths between targets", largest)
+            )
+    judged.parts.append(oriented)
+    judged.keys.append(KeyFigure(number(station.rms_px), "px", "Residuals of the station", "RMS"))
+    judged.reasons.append(f"redundancy {station.redundancy_total:.0f} of the station, sigma0 {number(station.sigma0)}")
+    if not station.converged:
+        judged.grade = "bad"
+        judged.parts.append("but the station's adjustment did not converge")

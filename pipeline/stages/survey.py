@@ -54,7 +54,7 @@ def survey_one(campaign: Campaign, run: Run, name: str, source: BodySource) -> S
     entry, images_of = source.survey_entry, source.survey
     if entry is None or images_of is None:
         raise InvalidInput(f"{campaign.path}: body '{name}' has no survey")
-    _check_lengths(campaign, name, entry)
+    check_lengths(campaign, name, entry)
     images, size = _images(run, name, images_of, source.file)
     targets = [
         BodyTarget(t.id, t.code, t.diameter, t.xyz, None if t.sigma is None else max(t.sigma))
@@ -105,7 +105,9 @@ def located(error: RobcalError, where: str) -> RobcalError:
     """The same error with the place in front of its message."""
     if isinstance(error, NotIdentifiable):
         return NotIdentifiable(f"{where}: {error}", error.parameters)
-    return type(error)(f"{where}: {error}") if isinstance(error, InvalidInput | DegenerateGeometry) else error
+    if isinstance(error, InvalidInput):
+        return InvalidInput(f"{where}: {error}")
+    return DegenerateGeometry(f"{where}: {error}") if isinstance(error, DegenerateGeometry) else error
 
 
 def lengths(entries: list[ScaleBarEntry] | list[CheckLengthEntry]) -> Lengths | None:
@@ -119,7 +121,7 @@ def lengths(entries: list[ScaleBarEntry] | list[CheckLengthEntry]) -> Lengths | 
     )
 
 
-def _check_lengths(campaign: Campaign, name: str, entry: SurveyEntry) -> None:
+def check_lengths(campaign: Campaign, name: str, entry: SurveyEntry) -> None:
     """The same distance stated twice with different lengths is a contradiction of the file itself."""
     seen: dict[tuple[int, ...], tuple[float, int]] = {}
     for i, bar in enumerate(entry.scale_bars):
@@ -224,18 +226,7 @@ def surveyed_body(name: str, file: BodyFile, done: SurveyResult, beside: frozens
 
 
 def _write(run: Run, name: str, source: BodySource, body: Body, done: SurveyResult) -> list[Any]:
-    write_body(
-        run.body(name),
-        [int(i) for i in body.ids],
-        body.points,
-        body.covariance,
-        codes=body.codes,
-        diameters=[None if not np.isfinite(d) else float(d) for d in body.diameters],
-        polarity=body.polarity,
-        normals=body.normals,
-        board=source.file.board,
-        comment=f"surveyed: {done.frame}; {done.scale}",
-    )
+    write_body(run.body(name), body, f"surveyed: {done.frame}; {done.scale}", source.file.board)
     sigma = np.sqrt(np.clip(np.diag(done.network.intrinsics_covariance), 0, None))
     start = source.survey.start if source.survey is not None else None
     pixel = start.pixel_um if start is not None else None

@@ -68,7 +68,7 @@ class Candidates:
 
 
 def choose_candidates(model: RobotModel, parameters: str | Sequence[str]) -> Candidates:
-    """Candidates of a choice 'standard', 'geometry', 'table5.4', or of named parameters.
+    """Candidates of a choice 'standard', 'geometry', 'table5.4', 'none' (the robot stays as it is), or of named ones.
 
     Base and tool are always among them. Order of preference within the geometry: base, tool, the joints' zero offsets,
     then frame by frame from the base; so what remains ambiguous is reported in terms of the outer frames.
@@ -85,6 +85,8 @@ def choose_candidates(model: RobotModel, parameters: str | Sequence[str]) -> Can
     cross = [f"{f.name}.{k}" for f in model.frames for k in ELASTIC_KINDS if f"{f.name}.{k}" not in own]
     if parameters == "standard":
         return Candidates((*ends, *zeros, *others, *terms), tuple(own), tuple(cross))
+    if parameters == "none":
+        return Candidates(tuple(ends))
     if parameters == "geometry":
         return Candidates((*ends, *zeros, *others, *terms))
     if parameters == "table5.4":
@@ -95,7 +97,9 @@ def choose_candidates(model: RobotModel, parameters: str | Sequence[str]) -> Can
         table = [f"{f.name}.{k}" for f, kinds in zip(model.joints, TABLE_5_4, strict=True) for k in kinds]
         return Candidates((*ends, *table, *terms))
     if isinstance(parameters, str):
-        raise InvalidInput(f"parameters must be standard, geometry, table5.4 or a list of names, not '{parameters}'")
+        raise InvalidInput(
+            f"parameters must be standard, geometry, table5.4, none or a list of names, not '{parameters}'"
+        )
     return Candidates(tuple(dict.fromkeys((*ends, *parameters, *terms))))
 
 
@@ -186,49 +190,12 @@ def choose_by_evidence(N: Array, b: Array, rest: float, rows: int, forced: int, 
 
     Weakness: stepwise; of two columns that say nearly the same the one tested last stays.
     """
-    p = len(b)
-    scale = np.sqrt(np.where(np.diag(N) > 0, np.diag(N), 1.0))
-    N, b = N / np.outer(scale, scale), b / scale
-    f = slice(0, forced)
-    solved = linalg.lstsq(N[f, f], np.column_stack([N[f, forced:], b[f]]), cond=1e-13)[0]
-    E = N[forced:, forced:] - N[forced:, f] @ solved[:, :-1]
-    c = b[forced:] - N[forced:, f] @ solved[:, -1]
-    rest = rest - float(b[f] @ solved[:, -1])
-    m = p - forced
-    alive = [k for k in range(m) if E[k, k] > 1e-10]
-
+    optional = _Optional.of(N, b, rest, rows, forced)
+    m, alive = len(optional.c), optional.alive
     n_cross = max(1, sum(1 for j in alive if j >= n_own))
     level = np.where(np.arange(m) < n_own, OWN_AXIS_LEVEL, CROSS_AXIS_LEVEL / n_cross)
-
-    def tests(chosen: list[int]) -> Array:
-        """p-values (m,): of removing each of the chosen, of adding each of the others; one for what is no candidate."""
-        values = np.ones(m)
-        others = [k for k in alive if k not in chosen]
-        total = rest
-        inverse: Array = np.zeros((0, 0))
-        across: Array = E[np.ix_(chosen, others)]
-        if chosen:
-            inverse = np.asarray(np.linalg.inv(E[np.ix_(chosen, chosen)]), dtype=float)
-            x = inverse @ c[chosen]
-            total = rest - float(c[chosen] @ x)
-            values[chosen] = p_value(x**2 / np.diag(inverse), total, len(chosen))
-        if others:
-            pivot = E[others, others] - np.einsum("ij,ij->j", across, inverse @ across)
-            left = c[others] - across.T @ (inverse @ c[chosen])
-            gain = np.where(pivot > 1e-12, left**2 / np.maximum(pivot, 1e-12), 0.0)
-            values[others] = p_value(gain, total - gain, len(chosen) + 1)
-        return values
-
-    def p_value(drop: Array, total: Array | float, n_chosen: int) -> Array:
-        freedom = rows - forced - n_chosen
-        if freedom <= 0:
-            return np.ones(len(drop))
-        positive = np.maximum(total, 1e-300)
-        p = special.fdtrc(1, freedom, np.maximum(drop, 0.0) * freedom / positive)
-        return np.where(np.asarray(total) > 0, p, 1.0)
-
     chosen = [k for k in alive if k < n_own]
-    values = tests(chosen)
+    values = optional.p_values(chosen)
     for _ in range(4 * m + 4):
         urgency = values / level
         worst = max(((urgency[k], k) for k in chosen), default=(0.0, -1))
@@ -239,8 +206,62 @@ def choose_by_evidence(N: Array, b: Array, rest: float, rows: int, forced: int, 
             if best[0] >= 0.5:  # stricter than for staying, so that nothing goes round in circles
                 break
             chosen.append(best[1])
-        values = tests(chosen)
+        values = optional.p_values(chosen)
     return StepwiseChoice(tuple(sorted(chosen)), values)
+
+
+@dataclass(frozen=True)
+class _Optional:
+    """Normal equations E (m, m), c (m,) of the optional columns after the forced ones, what these leave of the sum of
+    squares, and the degrees of freedom then."""
+
+    E: Array
+    c: Array
+    rest: float
+    freedom: int
+
+    @classmethod
+    def of(cls, N: Array, b: Array, rest: float, rows: int, forced: int) -> "_Optional":
+        """Eliminate the forced columns."""
+        scale = np.sqrt(np.where(np.diag(N) > 0, np.diag(N), 1.0))
+        N, b = N / np.outer(scale, scale), b / scale
+        f = slice(0, forced)
+        solved = linalg.lstsq(N[f, f], np.column_stack([N[f, forced:], b[f]]), cond=1e-13)[0]
+        E = N[forced:, forced:] - N[forced:, f] @ solved[:, :-1]
+        c = b[forced:] - N[forced:, f] @ solved[:, -1]
+        return cls(E, c, rest - float(b[f] @ solved[:, -1]), rows - forced)
+
+    @property
+    def alive(self) -> list[int]:
+        """Columns that are no combination of the forced ones."""
+        return np.flatnonzero(np.diag(self.E) > 1e-10).tolist()
+
+    def p_values(self, chosen: Sequence[int]) -> Array:
+        """p-values (m,): of removing each of the chosen, of adding each of the others; one for what is no candidate."""
+        values = np.ones(len(self.c))
+        others = [k for k in self.alive if k not in chosen]
+        total = self.rest
+        inverse: Array = np.zeros((0, 0))
+        across: Array = self.E[np.ix_(chosen, others)]
+        if chosen:
+            inverse = np.asarray(np.linalg.inv(self.E[np.ix_(chosen, chosen)]), dtype=float)
+            x = inverse @ self.c[chosen]
+            total = self.rest - float(self.c[chosen] @ x)
+            values[chosen] = self._p_value(x**2 / np.diag(inverse), total, len(chosen))
+        if others:
+            pivot = self.E[others, others] - np.einsum("ij,ij->j", across, inverse @ across)
+            left = self.c[others] - across.T @ (inverse @ self.c[chosen])
+            gain = np.where(pivot > 1e-12, left**2 / np.maximum(pivot, 1e-12), 0.0)
+            values[others] = self._p_value(gain, total - gain, len(chosen) + 1)
+        return values
+
+    def _p_value(self, drop: Array, total: Array | float, n_chosen: int) -> Array:
+        freedom = self.freedom - n_chosen
+        if freedom <= 0:
+            return np.ones(len(drop))
+        positive = np.maximum(total, 1e-300)
+        p = special.fdtrc(1, freedom, np.maximum(drop, 0.0) * freedom / positive)
+        return np.where(np.asarray(total) > 0, p, 1.0)
 
 
 def observability_indices(singular_values: Array) -> dict[str, float]:

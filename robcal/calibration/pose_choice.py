@@ -179,15 +179,16 @@ def travel(q: Array, ranges: Array) -> Array:
     return np.max(np.abs(scaled[:, None] - scaled[None]), axis=-1)
 
 
-def short_order(q: Array, ranges: Array, start: Array | None = None) -> NDArray[np.int_]:
+def short_order(q: Array, ranges: Array, start: Array | None = None, penalty: Array | None = None) -> NDArray[np.int_]:
     """Order (n,) of configurations with short travel: nearest neighbour from ``start``, then 2-opt exchanges.
 
-    The path is open. Weakness: a local optimum; collisions on the way between poses are not checked.
+    ``penalty`` (n, n) is added to the travel between two configurations, such as for a move that collides.
+    The path is open. Weakness: a local optimum.
     """
     n = len(q)
     if n < 3:
         return np.arange(n)
-    D = travel(q, ranges)
+    D = travel(q, ranges) + (0.0 if penalty is None else penalty)
     first = int(np.argmin(np.max(np.abs((q - start) / ranges), axis=1))) if start is not None else 0
     order = [first]
     left = set(range(n)) - {first}

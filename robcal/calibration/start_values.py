@@ -40,7 +40,10 @@ LEAST_TURN = 2e-3
 
 
 def candidates(
-    base_T_flange: Array, observations: Sequence[Observations], flange_T_tool: Array | None = None
+    base_T_flange: Array,
+    observations: Sequence[Observations],
+    flange_T_tool: Array | None = None,
+    turn: Array | None = None,
 ) -> list[Pair]:
     """Pairs (world_T_base, flange_T_tool) worth trying, best founded first; empty if nothing can be constructed.
 
@@ -49,6 +52,7 @@ def candidates(
     base_T_flange : (n, 4, 4) of the nominal robot at the poses.
     observations : what was measured.
     flange_T_tool : (4, 4) stated tool, whose place holds where the orientations leave it open; default the flange.
+    turn : (3, 3) orientation of a sensor in the hand, where it is known at least roughly.
     """
     near = np.zeros(3) if flange_T_tool is None else flange_T_tool[:3, 3]
     out: list[Pair] = []
@@ -70,7 +74,7 @@ def candidates(
         if isinstance(o, SensorPointObservations) and len(o.pose) >= 4:
             centre = o.p_sensor.mean(axis=0)
             for W, x in _one_target(base_T_flange[o.pose], o.p_world, near):
-                for R in _orientations():
+                for R in _orientations() if turn is None else [turn]:
                     out.append((W, tf.frame(R, x - R @ centre)))
         elif isinstance(o, DistanceObservations) and len(o.pose) >= 4 and not out:
             out += _from_distances(base_T_flange[o.pose], o.distance)

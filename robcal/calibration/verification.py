@@ -23,8 +23,10 @@ from robcal.calibration.observations import (
     SensorPointObservations,
     Stack,
 )
+from robcal.columns import Columns
 from robcal.errors import InvalidInput, NotIdentifiable
-from robcal.robot.kernel import Kernel, PoseInputs
+from robcal.robot.kernel import PoseInputs
+from robcal.robot.kernel_cache import kernel_of
 from robcal.robot.model import RobotModel
 
 Array = NDArray[np.float64]
@@ -153,13 +155,7 @@ def verify(
     poses, observations : the kept-out poses (n) and what was measured there.
     nominal : from :func:`fit_nominal` on the identification poses.
     """
-    T, C_T = robot.predict(poses)
-    square, degrees = _normalised(robot, poses, observations, T, C_T)
-    errors = tool_errors(T, observations)
-    nominal_errors = None if nominal is None else tool_errors(nominal.predict(poses)[0], observations)
-    return _verification(
-        "verify-set", poses, errors, nominal_errors, square, degrees, C_T, T, observations, np.arange(len(poses))
-    )
+    return _verification("verify-set", poses, observations, [_checked(robot, nominal, poses, observations)])
 
 
 def cross_validate(
@@ -169,7 +165,6 @@ def cross_validate(
     options: IdentifyOptions | None = None,
     folds: int = 5,
     groups: ArrayLike | None = None,
-    kernel: Kernel | None = None,
     stated: PoseInputs | None = None,
 ) -> Verification:
     """k-fold verification; every choice (parameters, outliers) is made anew in each fold, on its own poses alone.
@@ -189,38 +184,50 @@ def cross_validate(
     n_groups = int(labels.max()) + 1
     if n_groups < max(2, folds):
         raise NotIdentifiable(f"{n_groups} distinct poses cannot be divided into {folds} folds: measure more poses")
-    kernel = Kernel(model, chosen.statics) if kernel is None else kernel
+    kernel = kernel_of(model, chosen.statics)
     order = np.argsort(np.random.default_rng(0).permutation(n_groups)) % folds
     fold_of = order[labels]
-    parts: list[tuple] = []
+    parts: list[_Checked] = []
     for k in range(folds):
         out, inside = np.flatnonzero(fold_of == k), np.flatnonzero(fold_of != k)
         train = [o.subset(inside) for o in observations]
         test = [o.subset(out) for o in observations]
-        here = poses.subset(inside)
-        robot = identify(model, here, train, chosen, kernel)
-        nominal = fit_nominal(model, here, train, chosen)
-        there = (poses if stated is None else stated).subset(out)
-        T, C_T = robot.predict(there)
-        square, degrees = _normalised(robot, there, test, T, C_T)
-        parts.append((out, T, C_T, square, degrees, tool_errors(T, test), tool_errors(nominal.predict(there)[0], test)))
-    rows = np.concatenate([p[0] for p in parts])
-    merged = [
-        {
-            name: (
-                np.concatenate([p[0][p[at][name][0]] for p in parts]),
-                np.concatenate([p[at][name][1] for p in parts]),
-            )
-            for name in parts[0][at]
-        }
-        for at in (5, 6)
-    ]
-    square, degrees, C_T = (np.concatenate([p[at] for p in parts]) for at in (3, 4, 2))
-    T_all = np.zeros((len(poses), 4, 4))
-    T_all[rows] = np.concatenate([p[1] for p in parts])
-    return _verification(
-        "cross-validation", poses, merged[0], merged[1], square, degrees, C_T, T_all, observations, rows
-    )
+        here, there = poses.subset(inside), (poses if stated is None else stated).subset(out)
+        robot, nominal = identify(model, here, train, chosen, kernel), fit_nominal(model, here, train, chosen)
+        parts.append(_checked(robot, nominal, there, test, out))
+    return _verification("cross-validation", poses, observations, parts)
+
+
+@dataclass(frozen=True)
+class _Checked(Columns):
+    """Predictions (n, 4, 4) with covariance (n, 6, 6) at some ``rows`` of the poses, squared normalised errors with
+    their degrees (n,), and by test vector the errors of the robot and of the nominal one."""
+
+    rows: NDArray[np.int64]
+    T: Array
+    covariance: Array
+    normalised: Array
+    degrees: NDArray[np.int64]
+    errors: Mapping[str, Array]
+    nominal_errors: Mapping[str, Array] | None
+
+
+def _checked(
+    robot: CalibratedRobot,
+    nominal: CalibratedRobot | None,
+    poses: PoseInputs,
+    observations: Sequence[Observations],
+    rows: NDArray[np.int64] | None = None,
+) -> _Checked:
+    """The robots against measurements at poses; ``rows`` says which of all poses they are."""
+    T, covariance = robot.predict(poses)
+    square, degrees = _normalised(robot, poses, observations, T, covariance)
+    errors = {name: e for name, (_, e) in tool_errors(T, observations).items()}
+    nominal_errors = None
+    if nominal is not None:
+        nominal_errors = {n: e for n, (_, e) in tool_errors(nominal.predict(poses)[0], observations).items()}
+    at = np.arange(len(poses)) if rows is None else rows
+    return _Checked(at, T, covariance, square, degrees, errors, nominal_errors)
 
 
 def _normalised(
@@ -237,39 +244,41 @@ def _normalised(
 
 
 def _verification(
-    kind: str,
-    poses: PoseInputs,
-    errors: Mapping[str, tuple[NDArray[np.int64], Array]],
-    nominal: Mapping[str, tuple[NDArray[np.int64], Array]] | None,
-    square: Array,
-    degrees: NDArray[np.int64],
-    C_T: Array,
-    T: Array,
-    observations: Sequence[Observations],
-    rows: NDArray[np.int64],
+    kind: str, poses: PoseInputs, observations: Sequence[Observations], parts: Sequence[_Checked]
 ) -> Verification:
+    every = _Checked.concatenated(parts)
+    square, degrees = every.normalised, every.degrees
     measured = degrees > 0
     # repetitions of one another share what the model misses there: together they count as one pose
-    labels = np.unique(repetitions(poses.q)[rows][measured], return_inverse=True)[1]
+    labels = np.unique(repetitions(poses.q)[every.rows][measured], return_inverse=True)[1]
     weight = 1.0 / np.bincount(labels)[labels]
     total = float(np.sum(weight * square[measured] * degrees[measured]))
     freedom = float(np.sum(weight * degrees[measured]))
     inside = square[measured] * degrees[measured] <= stats.chi2.isf(0.05, degrees[measured])
+    errors = _by_vector([p.errors for p in parts])
+    compared = [p.nominal_errors for p in parts if p.nominal_errors is not None]
+    nominal = _by_vector(compared) if compared else None
+    T = np.empty_like(every.T)
+    T[every.rows] = every.T
     return Verification(
         kind=kind,
         poses=int(measured.sum()),
-        tools={name: ErrorStatistics.of(e) for name, (_, e) in errors.items()},
-        nominal=None if nominal is None else {name: ErrorStatistics.of(e) for name, (_, e) in nominal.items()},
-        errors={name: e for name, (_, e) in errors.items()},
-        nominal_errors=None if nominal is None else {name: e for name, (_, e) in nominal.items()},
+        tools={name: ErrorStatistics.of(e) for name, e in errors.items()},
+        nominal=None if nominal is None else {name: ErrorStatistics.of(e) for name, e in nominal.items()},
+        errors=errors,
+        nominal_errors=nominal,
         normalised=square,
         degrees=degrees,
         p_value=float(stats.chi2.sf(total, max(1.0, freedom))),
         coverage_95=float(np.average(inside, weights=weight)) if inside.size else float("nan"),
-        predicted=np.sqrt(np.trace(C_T[:, :3, :3], axis1=1, axis2=2) / 3.0),
+        predicted=np.sqrt(np.trace(every.covariance[:, :3, :3], axis1=1, axis2=2) / 3.0),
         iso=_pose_accuracy(poses, T, observations),
-        rows=rows,
+        rows=every.rows,
     )
+
+
+def _by_vector(parts: Sequence[Mapping[str, Array]]) -> dict[str, Array]:
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
 def _pose_accuracy(poses: PoseInputs, T: Array, observations: Sequence[Observations]) -> PoseAccuracy | None:

@@ -169,7 +169,7 @@ def master(
     p_value = global_test(0.5 * adjusted.sigma0**2 * adjusted.redundancy, adjusted.redundancy)[1]
     if stated and p_value < CONTRADICTED:
         state, adjusted = solved(None)
-    return _mastering(robot, problem, state, adjusted, chosen, gone, carried, log, p_value)
+    return _mastering(robot, _Solved(problem, state, adjusted, chosen, carried), gone, log, p_value)
 
 
 def _start(kernel: Kernel, reference: object, free: Sequence[str]) -> _State:
@@ -231,19 +231,27 @@ def _told(
     return wanted[kept], told
 
 
+@dataclass(frozen=True)
+class _Solved:
+    """The adjusted state; ``chosen`` are the unknowns of the problem that it solved for."""
+
+    problem: _Problem
+    state: _State
+    adjusted: Adjusted
+    chosen: NDArray[np.int64]
+    carried: CarriedFrames
+
+    @property
+    def names(self) -> list[str]:
+        """Of the unknowns that were solved for."""
+        return [self.problem.names[k] for k in self.chosen]
+
+
 def _mastering(
-    robot: CalibratedRobot,
-    problem: _Problem,
-    state: _State,
-    adjusted: Adjusted,
-    chosen: NDArray[np.int64],
-    gone: list[tuple[Eliminated, list[str]]],
-    carried: CarriedFrames,
-    log: JointLog,
-    p_value: float,
+    robot: CalibratedRobot, solved: _Solved, gone: list[tuple[Eliminated, list[str]]], log: JointLog, p_value: float
 ) -> Mastering:
     joints = robot.model.joints
-    names = [problem.names[k] for k in chosen]
+    names, state, adjusted = solved.names, solved.state, solved.adjusted
     by_name = {f.name: i for i, f in enumerate(joints)}
     rows = [i for i, name in enumerate(names) if name in by_name]
     found = tuple(names[i] for i in rows)
@@ -266,7 +274,7 @@ def _mastering(
         sigma0=adjusted.sigma0,
         redundancy=adjusted.redundancy,
         p_value=p_value,
-        robot=_with_offsets(robot, state, names, adjusted, carried, log),
+        robot=_with_offsets(robot, solved, log),
     )
 
 
@@ -275,15 +283,9 @@ def zero_parameter(joint: Frame) -> str:
     return f"{joint.name}.{joint.joint_kind}"
 
 
-def _with_offsets(
-    robot: CalibratedRobot,
-    state: _State,
-    names: Sequence[str],
-    adjusted: Adjusted,
-    carried: CarriedFrames,
-    log: JointLog,
-) -> CalibratedRobot:
+def _with_offsets(robot: CalibratedRobot, solved: _Solved, log: JointLog) -> CalibratedRobot:
     """The robot with the offsets among its parameters, and the covariance of all of them together."""
+    names, state, adjusted, carried = solved.names, solved.state, solved.adjusted, solved.carried
     model, joints = robot.model, {f.name: (k, f) for k, f in enumerate(robot.model.joints)}
     values = dict(model.parameters)
     new = list(carried.names)

@@ -205,7 +205,6 @@ def freeze(
     InvalidInput : fewer than three targets, an unknown parameter.
     NotIdentifiable : the tour cannot tell any of them.
     """
-    options = settings or DriftSettings()
     keys = list(dict.fromkeys(zip(readings.pose, readings.target.tolist(), strict=True)))
     targets = np.array([target for _, target in keys], dtype=np.int64)
     if len(set(targets.tolist())) < 3 or len(keys) < 6:
@@ -215,16 +214,9 @@ def freeze(
         )
     kernel = kernel_of(robot.model, robot.statics)
     kernel = kernel if sensor is None else kernel.with_references(None, sensor)
-    T = kernel.frames(kernel.theta0, readings.inputs)
-    seen = tf.transform(T, readings.x)
-    spread = tf.transport_covariance(T[:, :3, :3], readings.covariance)
     place = {key: k for k, key in enumerate(keys)}
     slot = np.array([place[key] for key in zip(readings.pose, readings.target.tolist(), strict=True)])
-    count = np.bincount(slot, minlength=len(keys)).astype(float)
-    p = np.stack([np.bincount(slot, seen[:, i], len(keys)) / count for i in range(3)], axis=1)
-    covariance = np.zeros((len(keys), 3, 3))
-    np.add.at(covariance, slot, spread)
-    covariance /= count[:, None, None] ** 2
+    p, covariance = _mean_places(kernel, readings, slot, len(keys))
     first = np.array([int(np.argmax(slot == k)) for k in range(len(keys))])
     sizes = thermal_sizes(robot.model) | dict(bounds or {})
     names = tuple(parameters) if parameters is not None else tuple(sizes)
@@ -243,10 +235,21 @@ def freeze(
         covariance,
         names,
         size,
-        options,
+        settings or DriftSettings(),
     )
     one_tour = readings.subset(first)
     kept = choose_parameters(made, one_tour, required=parameters is not None)
     if not len(kept):
         raise NotIdentifiable("the tour can tell none of the parameters that drift: measure from more directions")
     return replace(made, names=tuple(names[i] for i in kept), sizes=size[kept])
+
+
+def _mean_places(kernel: Kernel, readings: Readings, slot: Ints, n: int) -> tuple[Array, Array]:
+    """Places (n, 3) in the world, means of the readings of each ``slot`` (m,), with covariance (n, 3, 3)."""
+    T = kernel.frames(kernel.theta0, readings.inputs)
+    seen = tf.transform(T, readings.x)
+    count = np.bincount(slot, minlength=n).astype(float)
+    p = np.stack([np.bincount(slot, seen[:, i], n) / count for i in range(3)], axis=1)
+    covariance = np.zeros((n, 3, 3))
+    np.add.at(covariance, slot, tf.transport_covariance(T[:, :3, :3], readings.covariance))
+    return p, covariance / count[:, None, None] ** 2

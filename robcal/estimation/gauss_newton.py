@@ -88,26 +88,39 @@ def gauss_newton(
         small = max(settings.cost_tolerance * (1.0 + cost), settings.negligible * variance)
         if predicted_gain <= small:
             return state, summary(True, "a further step would not lower the cost")
-        length = 1.0
-        for _ in range(settings.max_halvings + 1):
-            candidate = retract(state, length * step)
-            trial = residuals(candidate)
-            new_cost = 0.5 * float(trial @ trial)
-            if np.isfinite(new_cost) and new_cost < cost:
-                break
-            length *= 0.5
-            halvings += 1
-        else:
+        found = _line_search(retract, residuals, state, step, cost, settings.max_halvings)
+        halvings += settings.max_halvings + 1 if found is None else found[2]
+        if found is None:
             near = predicted_gain <= 1e-3 + 1e-6 * cost  # a few hundredths of a standard deviation
             return state, summary(near, "no fraction of the step lowers the cost")
-        gain, state, cost = cost - new_cost, candidate, new_cost
+        gain, whole = cost - found[1], found[2] == 0
+        state, cost = found[:2]
         # as long as steps gain what was predicted the damping fades, and the last ones are undamped
         if gain > 0.75 * predicted_gain:
             trust *= TRUST_FACTOR
-        elif length < 1.0:
+        elif not whole:
             trust /= TRUST_FACTOR
         history.append(cost)
-        if gain <= small and length == 1.0:
+        if gain <= small and whole:
             return state, summary(True, "the last step lowered the cost by less than the tolerance")
         r, J = linearise(state)
     return state, summary(False, f"stopped after {settings.max_iterations} iterations")
+
+
+def _line_search(
+    retract: Callable[[State, Array], State],
+    residuals: Callable[[State], Array],
+    state: State,
+    step: Array,
+    cost: float,
+    most: int,
+) -> tuple[State, float, int] | None:
+    """State and cost after the largest of the fractions 1, 1/2, 1/4 ... of a step that lowers the cost, and how often
+    it was halved; None if none does."""
+    for halvings in range(most + 1):
+        candidate = retract(state, 0.5**halvings * step)
+        trial = residuals(candidate)
+        new_cost = 0.5 * float(trial @ trial)
+        if np.isfinite(new_cost) and new_cost < cost:
+            return candidate, new_cost, halvings
+    return None

@@ -1,6 +1,6 @@
 """Bodies (format robcal/body-1): targets with codes, diameters and coordinates, as given or as surveyed."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -14,7 +14,6 @@ from robcal.files.yaml_io import FlowMapping, YamlDocument, yaml_text
 from robcal.imaging.ring_code import canonical_id, is_id
 from robcal.photogrammetry.boards.layout import Board, BoardKind
 from robcal.photogrammetry.core.bodies import Body
-from robcal.transforms import Array
 
 FORMAT = "robcal/body-1"
 CODES = ("ring12", "corner", "circle")
@@ -30,6 +29,13 @@ class TargetEntry(Entry):
     sigma_mm: NotNegative | Triple | None = None
     polarity: Literal["bright", "dark"] | None = None
     normal: Triple | None = None
+
+
+class ShapeEntry(Entry):
+    """The surface that carries the targets."""
+
+    kind: Literal["sphere"]
+    radius_mm: Positive
 
 
 class BoardEntry(Entry):
@@ -51,6 +57,7 @@ class BodyEntry(Entry):
     format: Literal["robcal/body-1"]
     targets: list[TargetEntry] | None = None
     board: BoardEntry | None = None
+    shape: ShapeEntry | None = None
     polarity: Literal["bright", "dark"] | None = None
 
 
@@ -69,12 +76,16 @@ class BodyTargetRow:
 
 @dataclass(frozen=True)
 class BodyFile:
-    """Content of a body file; ``board`` where it is a printed one, whose targets are those of its layout."""
+    """Content of a body file.
+
+    ``board`` where it is a printed one, whose targets are those of its layout; ``radius`` (m) of a sphere.
+    """
 
     path: Path
     targets: tuple[BodyTargetRow, ...]
     polarity: str
     board: Board | None = None
+    radius: float | None = None
 
     def known(self) -> tuple[BodyTargetRow, ...]:
         """Targets with id and coordinates."""
@@ -89,12 +100,16 @@ def read_body(path: Path | str) -> BodyFile:
     InvalidInput : contradicts the format: duplicate ids, two targets in one place, a board that cannot be.
     """
     entry, document = read_entry(Path(path), BodyEntry, FORMAT)
-    rows = _rows(entry, document)
+    faults = list(_faults(entry, document))
+    if faults:
+        raise InvalidInput(faults[0], faults)
+    rows = [_row(target, entry.polarity or "bright") for target in entry.targets or ()]
     if entry.board is not None:
         return _with_board(entry, entry.board, document, rows)
     if not rows:
         raise InvalidInput(f"{document.path}: lists no targets: a body needs at least three, or a 'board'")
-    return BodyFile(document.path, tuple(rows), entry.polarity or "bright")
+    radius = None if entry.shape is None else entry.shape.radius_mm / 1000
+    return BodyFile(document.path, tuple(rows), entry.polarity or "bright", radius=radius)
 
 
 def _with_board(entry: BodyEntry, use: BoardEntry, document: YamlDocument, measured: list[BodyTargetRow]) -> BodyFile:
@@ -122,51 +137,52 @@ def _with_board(entry: BodyEntry, use: BoardEntry, document: YamlDocument, measu
     return BodyFile(document.path, tuple(rows), polarity, board)
 
 
-def _rows(entry: BodyEntry, document: YamlDocument) -> list[BodyTargetRow]:
-    """The listed targets in SI units."""
-    rows: list[BodyTargetRow] = []
+def _faults(entry: BodyEntry, document: YamlDocument) -> Iterator[str]:
+    """A sentence for each contradiction among the targets."""
     first: dict[int, int] = {}
     places: dict[tuple[float, float, float], int] = {}
-    for i, target in enumerate(entry.targets or ()):
-        line = document.line(("targets", i))
-        where = f"{document.path}, line {line}"
+    listed = entry.targets or []
+    lines = [document.line(("targets", i)) or 0 for i in range(len(listed))]
+    for i, target in enumerate(listed):
+        where = f"{document.path}, line {lines[i]}"
         if target.id is not None:
             if target.id < 0:
-                raise InvalidInput(f"{where}: target id {target.id} is negative: ids count from 0")
-            if target.id in first:
-                raise InvalidInput(
-                    f"{where}: target {target.id} stands twice (first in line {first[target.id]}): remove one or give "
-                    "it its own id"
+                yield f"{where}: target id {target.id} is negative: ids count from 0"
+            if first.setdefault(target.id, i) != i:
+                yield (
+                    f"{where}: target {target.id} stands twice (first in line {lines[first[target.id]]}): remove one "
+                    "or give it its own id"
                 )
-            first[target.id] = line or 0
         if target.code is not None and target.code not in CODES and not target.code.startswith("aruco:"):
-            raise InvalidInput(
+            yield (
                 f"{where}: unknown code '{target.code}': use ring12, aruco:<dictionary>, corner, circle or null (none)"
             )
         if target.code == "ring12" and target.id is None:
-            raise InvalidInput(f"{where}: a ring12 target needs its id (the number that its ring shows)")
+            yield f"{where}: a ring12 target needs its id (the number that its ring shows)"
         if target.xyz_mm is not None:
-            if target.xyz_mm in places:
-                raise InvalidInput(
-                    f"{where}: lies in the same place as the target of line {places[target.xyz_mm]}: "
+            if places.setdefault(target.xyz_mm, i) != i:
+                yield (
+                    f"{where}: lies in the same place as the target of line {lines[places[target.xyz_mm]]}: "
                     "check the coordinates"
                 )
-            places[target.xyz_mm] = line or 0
             if max(map(abs, target.xyz_mm)) > 1e6:
-                raise InvalidInput(f"{where}: coordinates beyond a kilometre: they are in mm")
-        sigma = target.sigma_mm
-        rows.append(
-            BodyTargetRow(
-                id=target.id,
-                code=target.code,
-                diameter=None if target.diameter_mm is None else target.diameter_mm / 1000,
-                xyz=None if target.xyz_mm is None else _metres(target.xyz_mm),
-                sigma=None if sigma is None else _metres(sigma if isinstance(sigma, tuple) else (sigma,) * 3),
-                polarity=target.polarity or entry.polarity or "bright",
-                normal=None if target.normal is None else _unit(target.normal, where),
-            )
-        )
-    return rows
+                yield f"{where}: coordinates beyond a kilometre: they are in mm"
+        length = 1.0 if target.normal is None else float(np.linalg.norm(target.normal))
+        if not 0.5 < length < 2.0:
+            yield f"{where}: normal has the length {length:g}: it is a direction of length 1"
+
+
+def _row(target: TargetEntry, polarity: str) -> BodyTargetRow:
+    sigma = target.sigma_mm
+    return BodyTargetRow(
+        id=target.id,
+        code=target.code,
+        diameter=None if target.diameter_mm is None else target.diameter_mm / 1000,
+        xyz=None if target.xyz_mm is None else _metres(target.xyz_mm),
+        sigma=None if sigma is None else _metres(sigma if isinstance(sigma, tuple) else (sigma,) * 3),
+        polarity=target.polarity or polarity,
+        normal=None if target.normal is None else _unit(target.normal),
+    )
 
 
 def _metres(values: Sequence[float]) -> tuple[float, float, float]:
@@ -174,10 +190,8 @@ def _metres(values: Sequence[float]) -> tuple[float, float, float]:
     return (x, y, z)
 
 
-def _unit(values: Sequence[float], where: str) -> tuple[float, float, float]:
+def _unit(values: Sequence[float]) -> tuple[float, float, float]:
     length = float(np.linalg.norm(values))
-    if not 0.5 < length < 2.0:
-        raise InvalidInput(f"{where}: normal has the length {length:g}: it is a direction of length 1")
     x, y, z = (v / length for v in values)
     return (x, y, z)
 
@@ -189,54 +203,46 @@ def check_ring_codes(body: BodyFile) -> None:
     ------
     InvalidInput : an id is not the smallest of its cyclic readings.
     """
+    faults = []
     for target in body.targets:
         code = target.id
         if target.code != "ring12" or code is None:
             continue
         if not 0 <= code < 4096:
-            raise InvalidInput(f"{body.path}: {code} is no ring12 id: twelve segments give 0 to 4095")
-        if not is_id(code):
-            raise InvalidInput(
+            faults.append(f"{body.path}: {code} is no ring12 id: twelve segments give 0 to 4095")
+        elif not is_id(code):
+            faults.append(
                 f"{body.path}: {code} is no ring12 id: the id is the smallest of its cyclic readings, here "
                 f"{canonical_id(code)}"
             )
+    if faults:
+        raise InvalidInput(faults[0], faults)
 
 
-def write_body(
-    path: Path | str,
-    ids: Sequence[int],
-    points: Array,
-    covariance: Array | None,
-    *,
-    codes: Sequence[str | None] | None = None,
-    diameters: Sequence[float | None] | None = None,
-    polarity: str = "bright",
-    normals: Array | None = None,
-    board: Board | None = None,
-    comment: str = "",
-) -> None:
-    """Write a body with coordinates (n, 3) in m and their covariance (3n, 3n) atomically.
+def write_body(path: Path | str, body: Body, comment: str = "", board: Board | None = None) -> None:
+    """Write a body with its coordinates atomically.
 
     ``sigma_mm`` is written for x, y and z apart; the full covariance has its place in the stage's cache. Coordinates of
     a ``board`` stand beside its layout.
     """
-    sigma = None if covariance is None else np.sqrt(np.clip(np.diag(covariance), 0, None)).reshape(-1, 3) * 1000
+    sigma = None
+    if body.covariance is not None:
+        sigma = np.sqrt(np.clip(np.diag(body.covariance), 0, None)).reshape(-1, 3) * 1000
     targets = []
-    for i, number in enumerate(ids):
-        row: dict[str, Any] = FlowMapping(id=int(number), code=codes[i] if codes and board is None else None)
-        diameter = diameters[i] if diameters else None
-        known = diameter is not None and np.isfinite(diameter)
-        row["diameter_mm"] = round(float(diameter) * 1000, 9) if diameter is not None and known else None
-        row["xyz_mm"] = [round(float(v), 9) for v in np.asarray(points[i]) * 1000]
+    for i, number in enumerate(body.ids):
+        row: dict[str, Any] = FlowMapping(id=int(number), code=body.codes[i] if board is None else None)
+        diameter = body.diameters[i]
+        row["diameter_mm"] = round(float(diameter) * 1000, 9) if np.isfinite(diameter) else None
+        row["xyz_mm"] = [round(float(v), 9) for v in body.points[i] * 1000]
         row["sigma_mm"] = None if sigma is None else [float(f"{v:.4g}") for v in sigma[i]]
-        if normals is not None and np.isfinite(normals[i]).all():
-            row["normal"] = [round(float(v), 6) for v in normals[i]]
+        if body.normals is not None and np.isfinite(body.normals[i]).all():
+            row["normal"] = [round(float(v), 6) for v in body.normals[i]]
         targets.append(row)
     data: dict[str, Any] = {"format": FORMAT}
     if board is not None:
         data["board"] = board_entry(board)
-    if polarity != ("bright" if board is None else "dark"):
-        data["polarity"] = polarity
+    if body.polarity != ("bright" if board is None else "dark"):
+        data["polarity"] = body.polarity
     data["targets"] = targets
     write_text(Path(path), yaml_text(data, comment))
 

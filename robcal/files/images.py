@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from robcal.errors import InvalidInput
 from robcal.files.storage import read_bytes
-from robcal.files.tiff import MAGIC, plain_tiff
+from robcal.files.tiff import MAGIC, plain_tiff, tiff_size
 
 SUFFIXES = frozenset({".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp"})
 MAX_BYTES = 1_500_000_000
@@ -55,6 +55,16 @@ def list_images(folder: Path, what: str) -> dict[str, Path]:
             what = "a link to a file that is not there" if path.is_symlink() else "a folder or a device, no image"
             raise InvalidInput(f"{path}: is {what}: remove or rename it")
     return {p.name: p for p in sorted(found, key=lambda p: natural_key(p.name))}
+
+
+def check_image_file(path: Path) -> None:
+    """Refuse what is no whole image of a size that can be worked on; nothing is decoded.
+
+    Raises
+    ------
+    InvalidInput : not an image, truncated, too large.
+    """
+    _check_complete(path, read_bytes(path, MAX_BYTES))
 
 
 def read_image(path: Path) -> GreyImage:
@@ -119,12 +129,15 @@ def _check_complete(path: Path, raw: bytes) -> None:
     elif raw.startswith(b"\xff\xd8"):
         # the last start of scan belongs to the main image; its end mark must follow it
         truncated = raw.rfind(b"\xff\xd9") < raw.rfind(b"\xff\xda")
+        width, height, depth = _jpeg_size(raw)
     elif raw.startswith(b"BM") and len(raw) >= 30:
         offset, _, width, height = struct.unpack("<IIii", raw[10:26])
         bits = struct.unpack("<H", raw[28:30])[0]
         compressed = len(raw) >= 34 and struct.unpack("<I", raw[30:34])[0] not in (0, 3)
         truncated = not compressed and len(raw) < offset + (abs(width) * bits + 31) // 32 * 4 * abs(height)
-    elif not raw.startswith(MAGIC):
+    elif raw.startswith(MAGIC):
+        width, height, depth = tiff_size(raw)
+    else:
         raise InvalidInput(f"{path}: is not a PNG, TIFF, JPEG or BMP image in spite of its name: convert or remove it")
     if abs(width) * abs(height) > MAX_PIXELS:
         raise InvalidInput(f"{path}: {abs(width)} x {abs(height)} pixels are more than {MAX_PIXELS}: crop the image")
@@ -133,6 +146,22 @@ def _check_complete(path: Path, raw: bytes) -> None:
         raise InvalidInput(f"{path}: {size:.1f} GB of colour values: save the image as grey values, or crop it")
     if truncated:
         raise InvalidInput(f"{path}: truncated image, its end is missing: copy it again or remove it")
+
+
+def _jpeg_size(raw: bytes) -> tuple[int, int, int]:
+    """Width, height and channels of the first frame header (ISO/IEC 10918-1, B.2.2); zeros where there is none."""
+    at = 2
+    while at + 10 <= len(raw) and raw[at] == 0xFF:
+        marker = raw[at + 1]
+        if marker == 0xFF or 0xD0 <= marker <= 0xD8 or marker == 0x01:
+            at += 1 if marker == 0xFF else 2
+            continue
+        length = int.from_bytes(raw[at + 2 : at + 4], "big")
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
+            height, width = struct.unpack(">HH", raw[at + 5 : at + 9])
+            return width, height, raw[at + 9]
+        at += 2 + length
+    return 0, 0, 1
 
 
 @contextmanager

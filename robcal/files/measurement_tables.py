@@ -93,7 +93,12 @@ def read_measurements(path: Path, pose_names: Sequence[str], kind: Kind | None =
     ------
     InvalidInput : not one of the kinds, unknown pose, doubled measurement, impossible numbers.
     """
-    table = read_table(path)
+    return measurements_of(read_table(path), pose_names, kind)
+
+
+def measurements_of(table: Table, pose_names: Sequence[str], kind: Kind | None = None) -> MeasuredTable:
+    """The measurements of a table, as :func:`read_measurements` does it."""
+    path = table.path
     kind = kind or _kind(table)
     needed = {
         "points": ["pose", "target", "x_mm", "y_mm", "z_mm"],
@@ -182,13 +187,13 @@ def _kind(table: Table) -> Kind:
 def _pose_index(table: Table, pose_names: Sequence[str]) -> tuple[IntArray, list[str]]:
     place = {name: i for i, name in enumerate(pose_names)}
     cells = table.texts("pose")
-    unknown = [i for i, cell in enumerate(cells) if cell not in place]
-    if unknown:
-        raise table.error(
-            unknown[0],
-            f"pose '{cells[unknown[0]]}' is not in the table of poses ({len(unknown)} such rows): add it there or "
-            "remove the row",
-        )
+    unknown = [cell not in place for cell in cells]
+    table.refuse(
+        unknown,
+        lambda i: (
+            f"pose '{cells[i]}' is not in the table of poses ({sum(unknown)} such rows): add it there or remove the row"
+        ),
+    )
     measured = set(cells)
     missing = [name for name in pose_names if name not in measured]
     notes = []
@@ -202,9 +207,11 @@ def _few(names: Sequence[str]) -> str:
 
 
 def _target_ids(table: Table) -> IntArray:
-    for i, cell in enumerate(table.columns["target"]):
-        if not cell.lstrip("-").isdigit():
-            raise table.error(i, f"target '{cell[:40]}' is not a whole number: targets are named by their integer ids")
+    cells = table.columns["target"]
+    table.refuse(
+        [not cell.lstrip("-").isdigit() for cell in cells],
+        lambda i: f"target '{cells[i][:40]}' is not a whole number: targets are named by their integer ids",
+    )
     return table.whole_numbers("target")
 
 
@@ -229,11 +236,9 @@ def point_covariance(table: Table) -> Array | None:
 
 
 def _positive_definite(table: Table, covariance: Array) -> Array:
-    lowest = np.linalg.eigvalsh(covariance)[:, 0]
-    bad = lowest <= 0
-    if bad.any():
-        remedy = "its variances must outweigh its covariances, check the columns"
-        raise table.error(int(np.argmax(bad)), f"the covariance is not positive definite: {remedy}")
+    remedy = "its variances must outweigh its covariances, check the columns"
+    bad = np.linalg.eigvalsh(covariance)[:, 0] <= 0
+    table.refuse(bad, lambda _: f"the covariance is not positive definite: {remedy}")
     return covariance
 
 
@@ -263,9 +268,9 @@ def _frame_covariance(table: Table, six: Array) -> Array | None:
 
 def _check_size(table: Table, values: Array) -> None:
     lengths = np.abs(values[:, :3, 3] if values.ndim == 3 else values.reshape(len(values), -1)).max(axis=1)
-    if (lengths > MAX_METRES).any():
-        i = int(np.argmax(lengths > MAX_METRES))
-        raise table.error(i, f"a length of {lengths[i]:.3g} m: coordinates are in mm, check the unit")
+    table.refuse(
+        lengths > MAX_METRES, lambda i: f"a length of {lengths[i]:.3g} m: coordinates are in mm, check the unit"
+    )
 
 
 def read_marks(path: Path, default_sigma: float = 0.1) -> MarksTable:
@@ -275,7 +280,12 @@ def read_marks(path: Path, default_sigma: float = 0.1) -> MarksTable:
     ------
     InvalidInput : missing columns, NaN, a target twice in one image.
     """
-    table = read_table(path)
+    return marks_of(read_table(path), default_sigma)
+
+
+def marks_of(table: Table, default_sigma: float = 0.1) -> MarksTable:
+    """The marks of a table, as :func:`read_marks` does it."""
+    path = table.path
     table.require(["image", "target", "x_px", "y_px"])
     if not len(table):
         raise InvalidInput(f"{path}: lists no marks")
@@ -283,9 +293,8 @@ def read_marks(path: Path, default_sigma: float = 0.1) -> MarksTable:
     target = _target_ids(table)
     table.unique(["image", "target"])
     xy = np.column_stack([table.numbers("x_px"), table.numbers("y_px")])
-    if np.abs(xy).max() > 1e6:
-        i = int(np.argmax(np.abs(xy).max(axis=1)))
-        raise table.error(i, "a mark a million pixels off the image: coordinates are in pixels")
+    far = np.abs(xy).max(axis=1) > 1e6
+    table.refuse(far, lambda _: "a mark a million pixels off the image: coordinates are in pixels")
     stated = table.has("sigma_px")
     sigma = table.numbers("sigma_px", positive=True) if stated else np.full(len(table), default_sigma)
     return MarksTable(path, image, target, xy, sigma, stated)

@@ -19,6 +19,8 @@ LIMIT_SLACK = 1e-3
 """Poses may lie this much (rad or m) beyond a limit: controllers round."""
 LONGEST_STEP = 3600.0
 """Time (s) from one pose to the next that no recording takes as a rule."""
+_HEADING = re.compile(r"(?:q|a|j|ax|axis|joint|e)[ _.]?\d{1,2}(?:[ _]?[\[(]?(?:deg|rad|mm|m|°)?[\])]?)")
+"""Headings that controllers and other programs give to joints."""
 NO_PAYLOAD = frozenset({"", "none", "-", "0"})
 
 
@@ -57,7 +59,12 @@ def read_poses(path: Path, robot: RobotModel | None, payloads: Collection[str], 
     InvalidInput : the table contradicts the contract or the robot (columns, payloads). Poses beyond the limits are only
         told (``outside``), since exchanged columns or wrong signs lead there as well.
     """
-    table = read_table(path)
+    return poses_of(read_table(path), robot, payloads, to_predict=to_predict)
+
+
+def poses_of(table: Table, robot: RobotModel | None, payloads: Collection[str], *, to_predict: bool = False) -> Poses:
+    """The poses of a table, as :func:`read_poses` does it."""
+    path = table.path
     table.require(["pose"])
     if not len(table):
         raise InvalidInput(f"{path}: lists no poses: one row per pose is needed")
@@ -72,7 +79,7 @@ def read_poses(path: Path, robot: RobotModel | None, payloads: Collection[str], 
     q = np.column_stack([table.numbers(name) * factor for name, factor in joints])
     notes: list[str] = []
     approach, inferred = _approach(table, q, to_predict, notes)
-    known = {"pose", "payload", "set", *(name for name, _ in joints)}
+    known = {"pose", "payload", "set", "target", "turn_deg", *(name for name, _ in joints)}
     known |= {f"approach{k}" for k in range(1, q.shape[1] + 1)}
     return Poses(
         path=path,
@@ -89,18 +96,29 @@ def read_poses(path: Path, robot: RobotModel | None, payloads: Collection[str], 
     )
 
 
+def _joint_number(heading: str) -> int:
+    return int(re.findall(r"\d+", heading)[0])
+
+
 def _check_joint_columns(table: Table, wanted: list[str]) -> None:
-    for name in wanted:
+    faults = []
+    for k, name in enumerate(wanted, start=1):
         if name in table.columns:
             continue
-        stem = name.split("_")[0]
-        other = [column for column in table.columns if column == stem or column.startswith(f"{stem}_")]
-        if other:
-            raise InvalidInput(
-                f"{table.path}, row 1: joint column '{other[0]}' must be '{name}': state the angle in degrees (a "
-                "sliding joint in mm) and name the column so"
+        alike = [
+            column for column in table.columns if _HEADING.fullmatch(column.lower()) and _joint_number(column) == k
+        ]
+        if alike:
+            faults.append(
+                f"{table.path}, row 1: joint column '{alike[0]}' must be '{name}': state the angle in degrees (a "
+                "sliding joint in mm) and name the column so, or map it in campaign.yaml with 'poses: {file: "
+                f"{table.path.name}, columns: {{{name}: {alike[0]}}}}}'"
             )
-        table.require([name])
+        else:
+            have = [column for column in table.columns if column not in wanted]
+            faults.append(f"{table.path}, row 1: column '{name}' is missing{proposal(name, have)}: needed are {name}")
+    if faults:
+        raise InvalidInput(faults[0], faults)
     beyond = [c for c in table.columns if re.fullmatch(r"q\d+_(deg|mm)", c) and c not in wanted]
     if beyond:
         raise InvalidInput(
@@ -140,20 +158,23 @@ def parse_payload(table: Table, payloads: Collection[str]) -> tuple[str | None, 
     if "payload" not in table.columns:
         return (None,) * len(table)
     cells = table.columns["payload"]
-    for i, cell in enumerate(cells):
-        if cell not in payloads and cell.lower() not in NO_PAYLOAD:
-            remedy = proposal(cell, sorted(payloads)) or ": the campaign lists none"
-            raise table.error(i, f"payload '{cell[:60]}' is not known{remedy}; add it to 'payloads' in campaign.yaml")
+    known = sorted(payloads)
+
+    def told(i: int) -> str:
+        remedy = proposal(cells[i], known) or ": the campaign lists none"
+        return f"payload '{cells[i][:60]}' is not known{remedy}; add it to 'payloads' in campaign.yaml"
+
+    table.refuse([cell not in payloads and cell.lower() not in NO_PAYLOAD for cell in cells], told)
     return tuple(cell if cell in payloads else None for cell in cells)
 
 
 def _verify(table: Table) -> NDArray[np.bool_]:
     if "set" not in table.columns:
         return np.zeros(len(table), dtype=bool)
-    for i, cell in enumerate(table.columns["set"]):
-        if cell not in ("identify", "verify"):
-            raise table.error(i, f"set is {shown(cell)}, it must be 'identify' or 'verify'")
-    return np.array([cell == "verify" for cell in table.columns["set"]])
+    cells = table.columns["set"]
+    bad = [cell not in ("identify", "verify") for cell in cells]
+    table.refuse(bad, lambda i: f"set is {shown(cells[i])}, it must be 'identify' or 'verify'")
+    return np.array([cell == "verify" for cell in cells])
 
 
 def _approach(table: Table, q: Array, to_predict: bool, notes: list[str]) -> tuple[Array, tuple[int, ...]]:
@@ -169,10 +190,9 @@ def _approach(table: Table, q: Array, to_predict: bool, notes: list[str]) -> tup
     for k, name in enumerate(columns):
         if given[k]:
             values = table.numbers(name)
-            bad = ~np.isin(values, (-1.0, 0.0, 1.0))
-            if bad.any():
-                i = int(np.argmax(bad))
-                raise table.error(i, f"{name} is {table.columns[name][i]}, it must be -1, 0 or +1")
+            cells = table.columns[name]
+            told = f"{name} is {{}}, it must be -1, 0 or +1"
+            table.refuse(~np.isin(values, (-1.0, 0.0, 1.0)), lambda i, cells=cells, told=told: told.format(cells[i]))  # type: ignore[misc]
             approach[:, k] = values
     return approach, () if to_predict else tuple(k for k, there in enumerate(given) if not there)
 

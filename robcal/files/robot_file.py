@@ -5,6 +5,7 @@ Beside the contract's keys a calibrated robot may hold ``terms`` (extra physical
 """
 
 import math
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -124,7 +125,9 @@ def read_robot(path: Path | str) -> RobotModel:
     InvalidInput : the file contradicts the contract; the message names line and remedy.
     """
     entry, document = read_entry(Path(path), RobotEntry, FORMAT)
-    _check(entry, document)
+    faults = list(_faults(entry, document))
+    if faults:
+        raise InvalidInput(faults[0], faults)
     return RobotModel(
         name=entry.name,
         frames=tuple(_frame(frame) for frame in entry.frames),
@@ -161,40 +164,41 @@ def _frame(entry: FrameEntry) -> Frame:
     )
 
 
-def _check(entry: RobotEntry, document: YamlDocument) -> None:
+def _faults(entry: RobotEntry, document: YamlDocument) -> Iterator[str]:
+    """A sentence for each contradiction in the file."""
     names = [frame.name for frame in entry.frames]
     for i, frame in enumerate(entry.frames):
         where = f"{document.path}, line {document.line(('frames', i))}: frame '{frame.name}'"
         if names.index(frame.name) != i:
-            raise InvalidInput(f"{where} stands twice: give every frame its own name")
+            yield f"{where} stands twice: give every frame its own name"
         if frame.name in {*RESERVED_FRAME_NAMES, "world"} or "." in frame.name:
-            raise InvalidInput(
+            yield (
                 f"{where}: a frame's name must have no dot and not be base, tool, gravity, payload or world: "
                 "it is the first half of parameter names"
             )
         if frame.type == "prismatic" and frame.axis is None:
-            raise InvalidInput(f"{where}: a sliding joint needs an axis (x, y or z)")
+            yield f"{where}: a sliding joint needs an axis (x, y or z)"
         if frame.range_mm is not None and frame.type != "prismatic":
-            raise InvalidInput(f"{where}: range_mm is for sliding joints: use range_deg or add 'type: prismatic'")
+            yield f"{where}: range_mm is for sliding joints: use range_deg or add 'type: prismatic'"
         if frame.range_deg is not None and frame.type == "prismatic":
-            raise InvalidInput(f"{where}: range_deg is for turning joints: use range_mm")
+            yield f"{where}: range_deg is for turning joints: use range_mm"
         for limits in (frame.range_deg, frame.range_mm):
             if limits is not None and limits[0] >= limits[1]:
-                raise InvalidInput(f"{where}: the range {list(limits)} is empty: the smaller limit comes first")
+                yield f"{where}: the range {list(limits)} is empty: the smaller limit comes first"
     if not any(frame.axis for frame in entry.frames):
-        raise InvalidInput(f"{document.path}: the chain has no joints: at least one frame needs an axis (x, y or z)")
+        yield f"{document.path}: the chain has no joints: at least one frame needs an axis (x, y or z)"
     size = math.dist(entry.gravity_m_s2, (0, 0, 0))
     if size > 30:
-        raise InvalidInput(
+        yield (
             f"{document.path}, line {document.line(('gravity_m_s2',))}: gravity of {size:.4g} m/s2 is not of this "
             "world: it is in m/s2, about 9.81"
         )
     known_terms = {term.name for term in entry.terms}
     for key in entry.parameters:
-        _check_parameter(key, names, known_terms, set(entry.payloads), document)
+        yield from _parameter_faults(key, names, known_terms, set(entry.payloads), document)
     for i, term in enumerate(entry.terms):
         if term.frame not in {*names, "base", "tool"}:
-            raise InvalidInput(
+            yield (
                 f"{document.path}, line {document.line(('terms', i, 'frame'))}: term '{term.name}' acts on the unknown "
                 f"frame '{term.frame}'{proposal(term.frame, [*names, 'base', 'tool'])}"
             )
@@ -204,20 +208,22 @@ _KINDS = ["x", "y", "z", "roll", "pitch", "yaw"]
 _FRAME_KINDS = [*_KINDS, "elastic_roll", "elastic_pitch", "elastic_yaw"]
 
 
-def _check_parameter(key: str, frames: list[str], terms: set[str], payloads: set[str], document: YamlDocument) -> None:
+def _parameter_faults(
+    key: str, frames: list[str], terms: set[str], payloads: set[str], document: YamlDocument
+) -> Iterator[str]:
     owner, _, kind = key.rpartition(".")
     where = f"{document.path}, line {document.line(('parameters', key))}: parameter '{key}'"
     if owner in terms:
         return
     if owner.startswith("payload."):
         if owner.removeprefix("payload.") not in payloads or kind not in {"mass", "x", "y", "z"}:
-            raise InvalidInput(f"{where} names no payload of this file: payload.<name>.mass, x, y or z")
+            yield f"{where} names no payload of this file: payload.<name>.mass, x, y or z"
         return
     known = {"base": _KINDS, "tool": _KINDS, "gravity": ["tilt_x", "tilt_y"], **dict.fromkeys(frames, _FRAME_KINDS)}
     if owner not in known:
-        raise InvalidInput(f"{where}: there is no frame '{owner}'{proposal(owner, list(known))}")
-    if kind not in known[owner]:
-        raise InvalidInput(f"{where}: unknown kind '{kind}'{proposal(kind, known[owner])}")
+        yield f"{where}: there is no frame '{owner}'{proposal(owner, list(known))}"
+    elif kind not in known[owner]:
+        yield f"{where}: unknown kind '{kind}'{proposal(kind, known[owner])}"
 
 
 def _listed(values: Array) -> list[float]:

@@ -3,19 +3,26 @@
 A validation error becomes one sentence that names the file, the line, the entry and the remedy.
 """
 
+import copy
 import difflib
+import functools
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError, model_validator
-from pydantic_core import PydanticCustomError
+from pydantic_core import ErrorDetails, PydanticCustomError
 
 from robcal.errors import InvalidInput
 from robcal.files.yaml_io import YamlDocument, read_yaml
 
 MAX_TEXT = 1000
 """Characters of a name or path; longer ones are no names."""
+MOST_ROUNDS = 12
+"""How often an entry is left out and the rest looked at again."""
+
+Place = tuple[int | str, ...]
 
 
 def _number(value: Any) -> Any:
@@ -92,7 +99,8 @@ class Entry(BaseModel):
         for key in data:
             if key not in known:
                 told = f"unknown key '{key}'{proposal(str(key), known)}"
-                raise PydanticCustomError("unknown_key", "{told}", {"told": told, "key": str(key)})
+                context = {"told": told, "key": str(key), "meant": nearest(str(key), known) or ""}
+                raise PydanticCustomError("unknown_key", "{told}", context)
         return data
 
 
@@ -100,12 +108,18 @@ def _names(cls: type[BaseModel]) -> list[str]:
     return [info.alias or name for name, info in cls.model_fields.items()]
 
 
-def proposal(word: str, known: list[str]) -> str:
-    """Text that names the nearest known word, or all of them when none is near."""
+def nearest(word: str, known: list[str]) -> str | None:
+    """The known word that is meant, None when none is near."""
     lowered = {name.lower(): name for name in known}
     near = difflib.get_close_matches(word.lower(), lowered, n=1, cutoff=0.6)
+    return lowered[near[0]] if near else None
+
+
+def proposal(word: str, known: list[str]) -> str:
+    """Text that names the nearest known word, or all of them when none is near."""
+    near = nearest(word, known)
     if near:
-        return f": did you mean '{lowered[near[0]]}'?"
+        return f": did you mean '{near}'?"
     listed = ", ".join(known[:30]) + (", ..." if len(known) > 30 else "")
     return f": known are {listed}" if known else ""
 
@@ -118,16 +132,71 @@ def parse(document: YamlDocument, schema: type[E], file_format: str) -> E:
 
     Raises
     ------
-    InvalidInput : wrong or missing ``format``, unknown key, wrong type; the first problem in one sentence.
+    InvalidInput : wrong or missing ``format``, unknown key, wrong type; all problems in a sentence each.
     """
-    found = document.data.get("format")
+    entry, faults = parse_leniently(document, schema, file_format)
+    if entry is None or faults:
+        raise InvalidInput(faults[0], faults)
+    return entry
+
+
+def parse_leniently(document: YamlDocument, schema: type[E], file_format: str) -> tuple[E | None, list[str]]:
+    """The content of a document as far as it can be read, and a sentence for every problem in it.
+
+    A misspelt key is taken for the one that is meant, other entries that are wrong are left out; None where nothing
+    is left to go on with.
+    """
+    faults: list[str] = []
+    data = copy.deepcopy(document.data)
+    found = data.get("format")
     if found != file_format:
         told = "is missing" if found is None else f"is {shown(found)}"
-        raise InvalidInput(f"{document.path}: 'format' {told}, this must be a file of the format '{file_format}'")
-    try:
-        return schema.model_validate(document.data)
-    except ValidationError as error:
-        raise InvalidInput(first_problem(document, error)) from None
+        return None, [f"{document.path}: 'format' {told}, this must be a file of the format '{file_format}'"]
+    for _ in range(MOST_ROUNDS):
+        try:
+            return schema.model_validate(data), faults
+        except ValidationError as error:
+            problems = _problems(replace(document, data=data), error)
+        new = [text for _, _, text in problems if text not in faults]
+        faults += new
+        mended = [_mend(data, place, problem) for problem, place, _ in problems]
+        if not new or not all(mended):
+            break
+    return None, faults
+
+
+def _problems(document: YamlDocument, error: ValidationError) -> list[tuple[ErrorDetails, Place, str]]:
+    """Problems of a validation error, each with its place and its sentence.
+
+    An alternative (a | b) reports one problem for each branch; the deepest place is the branch that was meant.
+    """
+    found: list[tuple[ErrorDetails, Place, str]] = []
+    for problem in sorted(error.errors(), key=lambda item: -len(_place(item["loc"], document))):
+        place = _place(problem["loc"], document)
+        if problem["type"] == "unknown_key" or all(other[: len(place)] != place for _, other, _ in found):
+            found.append((problem, place, _sentence(document, problem, place)))
+    return found
+
+
+def _inside(data: Any, place: Place) -> Any:
+    return functools.reduce(lambda inner, step: inner[step], place, data)
+
+
+def _mend(data: dict[str, Any], place: Place, problem: ErrorDetails) -> bool:
+    """Rename a misspelt key, or leave out the entry of a problem; false where that is not possible."""
+    if problem["type"] == "unknown_key":
+        holder = _inside(data, place)
+        key, meant = problem["ctx"]["key"], problem["ctx"]["meant"]
+        value = next((holder.pop(name) for name in list(holder) if str(name) == key), None)
+        if meant and meant not in holder:
+            holder[meant] = value
+        return True
+    while place and isinstance(place[-1], int):
+        place = place[:-1]
+    if not place:
+        return False
+    _inside(data, place[:-1]).pop(place[-1], None)
+    return True
 
 
 def read_entry(path: Path, schema: type[E], file_format: str) -> tuple[E, YamlDocument]:
@@ -136,11 +205,8 @@ def read_entry(path: Path, schema: type[E], file_format: str) -> tuple[E, YamlDo
     return parse(document, schema, file_format), document
 
 
-def first_problem(document: YamlDocument, error: ValidationError) -> str:
-    """One sentence about the first problem of a validation error, with file and line."""
-    # An alternative (a | b) reports one problem for each branch; the deepest place is the branch that was meant.
-    problem = max(error.errors(), key=lambda item: len(_place(item["loc"], document)))
-    place = _place(problem["loc"], document)
+def _sentence(document: YamlDocument, problem: ErrorDetails, place: Place) -> str:
+    """One sentence about a problem, with file and line."""
     key = problem.get("ctx", {}).get("key") if problem["type"] == "unknown_key" else None
     line = document.line(place if key is None else (*place, key))
     where = f"{document.path}, line {line}" if line else f"{document.path}"
@@ -156,7 +222,7 @@ def first_problem(document: YamlDocument, error: ValidationError) -> str:
     return f"{where}: {name + ': ' if name else ''}{told}"
 
 
-def _place(location: tuple[int | str, ...], document: YamlDocument) -> tuple[int | str, ...]:
+def _place(location: Place, document: YamlDocument) -> Place:
     """Pydantic's location without the names of union branches, which are no keys of the file."""
     place: list[int | str] = []
     data: Any = document.data
@@ -168,7 +234,7 @@ def _place(location: tuple[int | str, ...], document: YamlDocument) -> tuple[int
     return tuple(place)
 
 
-def _dotted(place: tuple[int | str, ...]) -> str:
+def _dotted(place: Place) -> str:
     text = ""
     for step in place:
         text += f"[{step}]" if isinstance(step, int) else f".{step}" if text else str(step)

@@ -8,12 +8,12 @@ Rows are counted as in an editor: the header is row 1.
 import csv
 import io
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from robcal.errors import InvalidInput
 from robcal.files.schemas import proposal, shown
@@ -23,7 +23,22 @@ from robcal.transforms import Array
 MAX_BYTES = 400_000_000
 MAX_ROWS = 5_000_000
 MAX_CELL = 10_000
+MOST_TOLD = 20
+"""Faulty rows of one kind that are listed."""
 MISSING = frozenset({"", "nan", "na", "n/a", "null", "none", "-"})
+
+
+class FaultyRows(InvalidInput):
+    """Rows of a table that contradict its format.
+
+    Attributes
+    ----------
+    rest : the table without them.
+    """
+
+    def __init__(self, faults: Sequence[str], rest: "Table") -> None:
+        super().__init__(faults[0], faults)
+        self.rest = rest
 
 
 @dataclass(frozen=True)
@@ -47,26 +62,51 @@ class Table:
         """Whether all these columns are there."""
         return all(name in self.columns for name in names)
 
-    def error(self, record: int, message: str) -> InvalidInput:
+    def error(self, record: int, message: str) -> FaultyRows:
         """An error that names file and row."""
-        return InvalidInput(f"{self.path}, row {int(self.rows[record])}: {message}")
+        return FaultyRows([self._told(record, message)], self.without([record]))
+
+    def _told(self, record: int, message: str) -> str:
+        return f"{self.path}, row {int(self.rows[record])}: {message}"
+
+    def refuse(self, bad: ArrayLike, message: Callable[[int], str]) -> None:
+        """Raise an error that names all bad records (mask), if there are any; ``message`` says what is wrong with one.
+
+        Raises
+        ------
+        FaultyRows : some are bad.
+        """
+        records = np.flatnonzero(bad)
+        if len(records):
+            faults = [self._told(int(i), message(int(i))) for i in records[:MOST_TOLD]]
+            if len(records) > MOST_TOLD:
+                faults.append(f"{self.path}: {len(records) - MOST_TOLD} more rows like these")
+            raise FaultyRows(faults, self.without(records))
+
+    def without(self, records: ArrayLike) -> "Table":
+        """The table without some records."""
+        kept = np.setdiff1d(np.arange(len(self)), records)
+        columns = {name: tuple(cells[i] for i in kept) for name, cells in self.columns.items()}
+        return replace(self, columns=columns, rows=self.rows[kept])
 
     def require(self, names: Sequence[str]) -> None:
-        """Raise InvalidInput if a column is missing."""
-        for name in names:
-            if name not in self.columns:
-                have = [column for column in self.columns if column not in names]
-                needed = ", ".join(names)
-                raise InvalidInput(
-                    f"{self.path}, row 1: column '{name}' is missing{proposal(name, have)}: needed are {needed}"
-                )
+        """Raise InvalidInput if columns are missing."""
+        have = [column for column in self.columns if column not in names]
+        needed = ", ".join(names)
+        missing = [
+            f"{self.path}, row 1: column '{name}' is missing{proposal(name, have)}: needed are {needed}"
+            for name in names
+            if name not in self.columns
+        ]
+        if missing:
+            raise InvalidInput(missing[0], missing)
 
     def texts(self, name: str) -> tuple[str, ...]:
         """A column of names, none empty."""
         self.require([name])
-        for i, cell in enumerate(self.columns[name]):
-            if not cell:
-                raise self.error(i, f"{name} is empty: give a name or remove the row")
+        self.refuse(
+            [not cell for cell in self.columns[name]], lambda i: f"{name} is empty: give a name or remove the row"
+        )
         return self.columns[name]
 
     def numbers(self, name: str, *, positive: bool = False) -> Array:
@@ -79,22 +119,20 @@ class Table:
         self.require([name])
         cells = self.columns[name]
         values = np.array([_float_or_nan(cell) for cell in cells], dtype=float)
-        bad = ~np.isfinite(values)
-        if bad.any():
-            i = int(np.argmax(bad))
-            raise self.error(i, f"{name} is {_bad_number(cells[i])}: give a finite number or remove the row")
-        if positive and (values <= 0).any():
-            i = int(np.argmax(values <= 0))
-            raise self.error(i, f"{name} is {cells[i]}, it must be larger than zero: correct it or remove the column")
+        self.refuse(
+            ~np.isfinite(values), lambda i: f"{name} is {_bad_number(cells[i])}: give a finite number or remove the row"
+        )
+        if positive:
+            remedy = "it must be larger than zero: correct it or remove the column"
+            self.refuse(values <= 0, lambda i: f"{name} is {cells[i]}, {remedy}")
         return values
 
     def whole_numbers(self, name: str) -> NDArray[np.int64]:
         """A column of whole numbers."""
         values = self.numbers(name)
+        cells = self.columns[name]
         bad = (values != np.round(values)) | (np.abs(values) > 2**53)
-        if bad.any():
-            i = int(np.argmax(bad))
-            raise self.error(i, f"{name} is {shown(self.columns[name][i])}, it must be a whole number")
+        self.refuse(bad, lambda i: f"{name} is {shown(cells[i])}, it must be a whole number")
         return values.astype(np.int64)
 
     def number_column(self, name: str) -> Array | None:
@@ -104,13 +142,15 @@ class Table:
 
     def unique(self, names: Sequence[str]) -> None:
         """Raise InvalidInput if two rows agree in these columns."""
+        keys = list(zip(*(self.columns[name] for name in names), strict=True))
         seen: dict[tuple[str, ...], int] = {}
-        for i, key in enumerate(zip(*(self.columns[name] for name in names), strict=True)):
-            if key in seen:
-                what = ", ".join(f"{name} {cell}" for name, cell in zip(names, key, strict=True))
-                first = int(self.rows[seen[key]])
-                raise self.error(i, f"{what} stands twice (first in row {first}): remove one of them")
-            seen[key] = i
+        first = [seen.setdefault(key, i) for i, key in enumerate(keys)]
+
+        def told(i: int) -> str:
+            what = ", ".join(f"{name} {cell}" for name, cell in zip(names, keys[i], strict=True))
+            return f"{what} stands twice (first in row {int(self.rows[first[i]])}): remove one of them"
+
+        self.refuse(np.array(first, dtype=np.int64) != np.arange(len(keys)), told)
 
 
 def _float_or_nan(cell: str) -> float:
@@ -134,7 +174,8 @@ def read_table(path: Path) -> Table:
 
     Raises
     ------
-    InvalidInput : unreadable, other separators or encodings, doubled columns, ragged rows.
+    InvalidInput : unreadable, other separators or encodings, doubled columns.
+    FaultyRows : rows of another length.
     """
     raw = read_bytes(path, MAX_BYTES)
     if raw[:2] in (b"\xff\xfe", b"\xfe\xff"):
@@ -150,6 +191,7 @@ def read_table(path: Path) -> Table:
     header: list[str] | None = None
     records: list[list[str]] = []
     rows: list[int] = []
+    ragged: list[str] = []
     start = 1
     try:
         for record in reader:
@@ -162,10 +204,11 @@ def read_table(path: Path) -> Table:
             if len(record) > len(header) and not any(cell.strip() for cell in record[len(header) :]):
                 record = record[: len(header)]
             if len(record) != len(header):
-                raise InvalidInput(
+                ragged.append(
                     f"{path}, row {row}: has {len(record)} cells where the header has {len(header)}: "
                     "add or remove cells (decimal point, not comma)"
                 )
+                continue
             records.append([cell.strip() for cell in record])
             rows.append(row)
             if len(rows) > MAX_ROWS:
@@ -176,7 +219,10 @@ def read_table(path: Path) -> Table:
         raise InvalidInput(f"{path}: is empty: the first row must name the columns")
     by_column = zip(*records, strict=True) if records else [() for _ in header]
     columns = {name: tuple(cells) for name, cells in zip(header, by_column, strict=True)}
-    return Table(path, columns, np.array(rows, dtype=np.int64))
+    table = Table(path, columns, np.array(rows, dtype=np.int64))
+    if ragged:
+        raise FaultyRows(ragged[:MOST_TOLD], table)
+    return table
 
 
 def _header(path: Path, row: int, record: list[str]) -> list[str]:

@@ -12,6 +12,7 @@ from robcal.errors import InvalidInput
 
 MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 SUBFILE, BITS, PHOTOMETRIC, ORIENTATION, SAMPLES, CFA = 254, 258, 262, 274, 277, 33421
+WIDTH, LENGTH = 256, 257
 WHITE_IS_ZERO, BLACK_IS_ZERO, MOSAIC, LINEAR_RAW = 0, 1, 32803, 34892
 MOST_PAGES = 1000
 _WIDTH = {3: "H", 4: "I", 16: "Q", 1: "B"}
@@ -66,6 +67,18 @@ def plain_tiff(path: Path, raw: bytes) -> tuple[bytes, bool]:
             _, place, kind = page.first[tag]
             struct.pack_into(order + kind, out, place, wanted)
     return bytes(out), inverted
+
+
+def tiff_size(raw: bytes) -> tuple[int, int, int]:
+    """Width, height and bytes a pixel of the largest image that a file declares; zeros where it declares none."""
+    try:
+        _, pages = _pages(raw)
+    except struct.error:
+        return 0, 0, 1
+    sizes = [
+        (p.value(WIDTH, 0), p.value(LENGTH, 0), p.value(SAMPLES, 1) * max(p.value(BITS, 8) // 8, 1)) for p in pages
+    ]
+    return max(sizes, key=lambda size: size[0] * size[1] * size[2], default=(0, 0, 1))
 
 
 def _pages(raw: bytes) -> tuple[str, list[_Page]]:

@@ -106,6 +106,14 @@ def _positions(data: ObservationData) -> Array:
 
 
 def _station(data: ObservationData) -> Iterator[ObservationCause]:
+    yield from _scale(data)
+    if data.kind == "points":
+        yield from refraction_causes(data)
+    yield _moved(data)
+
+
+def _scale(data: ObservationData) -> Iterator[ObservationCause]:
+    """The scale of the station, constant, with temperatures, and with time."""
     scale = ObservationCause(
         SCALE_ERROR,
         "station",
@@ -147,8 +155,10 @@ def _station(data: ObservationData) -> Iterator[ObservationCause]:
             continuous={"tau_h": (0.02 * duration, 10.0 * duration)},
             observation_shift=lambda d, c: _world(d, _positions(d)[:, :, None] * course(d, c["tau_h"])),
         )
-    if data.kind == "points":
-        yield from refraction_causes(data)
+
+
+def _moved(data: ObservationData) -> ObservationCause:
+    """The station (or a camera of it) was moved before some pose."""
     first, every = breaks(data.variables["index"], 3)
 
     def moved(d: ObservationData, c: Constants) -> Array:
@@ -159,7 +169,7 @@ def _station(data: ObservationData) -> Iterator[ObservationCause]:
         shift = np.concatenate([turn, _cross_columns(arm)], axis=2)
         return _world(d, shift * after, np.concatenate([np.zeros_like(turn), turn], axis=2) * after)
 
-    yield ObservationCause(
+    return ObservationCause(
         CAMERA_MOVED,
         "station",
         None,

@@ -10,6 +10,8 @@ from robcal.calibration.calibrated import CalibratedRobot
 from robcal.calibration.identifiability import repetitions
 from robcal.calibration.identification import IdentifyOptions
 from robcal.calibration.instruments import IdentifiedInstruments, Instrument, identify_instruments
+from robcal.calibration.instruments.evaluator import Part
+from robcal.calibration.instruments.placing import place
 from robcal.calibration.joint_log import JointLog
 from robcal.calibration.recording_errors.search import check_joint_log
 from robcal.calibration.verification import ErrorStatistics, Verification, fit_nominal, verify
@@ -19,6 +21,9 @@ from robcal.recipe.verification import FOLDS, RobotVerification
 from robcal.robot.kernel import Kernel
 from robcal.robot.model import RobotModel
 
+CARRIED, TIED = float(np.radians(0.02)), 0.95
+"""Points tell a sensor's orientation where its standard deviation is below this (rad) and no angle is correlated more
+than that with the sensor's origin."""
 USUAL_LENGTH, SURE = 2e-4, 2.0
 """Deviation of a link (m) that is usual; one that is larger by this many standard deviations is told."""
 
@@ -46,12 +51,47 @@ def identify_from_instruments(
         if slips and start is model:
             start = model.with_parameters({**model.parameters, **slips[0].values})
             notes.append(f"{slips[0].statement}; {slips[0].remedy}")
+    instruments, told = with_told_orientations(Kernel(start), log, instruments)
+    notes += told
     found = identify_instruments(start, log, instruments, options)
     found = replace(found, notes=(*found.notes, *length_alarms(found)))
     silent = [i.name for i in instruments if not i.recording.stated]
     if silent:
         notes.append(f"{' and '.join(silent)}: no uncertainty is stated, it is estimated from the residuals")
     return replace(found, notes=(*notes, *found.notes))
+
+
+def with_told_orientations(
+    kernel: Kernel, log: JointLog, instruments: Sequence[Instrument]
+) -> tuple[list[Instrument], list[str]]:
+    """Instruments of which the orientation of a certificate is freed where the points tell it better; a note each.
+
+    A sensor that stands at one distance, square to what it looks at, sees its own tilt as a displacement of its origin.
+    """
+    out, notes = [], []
+    for i in instruments:
+        rows = np.array([k for k in i.recording.poses if not log.verify[k]], dtype=np.int64)
+        if not i.tool.certified or not len(rows):
+            out.append(i)
+            continue
+        free = i.tool.with_free_angles()
+        part = Part(i.name, log.inputs(kernel).subset(rows), i.recording.select(rows), i.world, free)
+        at = place(part, kernel.with_references(np.eye(4), np.eye(4)).frames(kernel.theta0, part.poses))
+        rows_told = sum(len(o.pose) * o.dimension for o in part.observations)
+        scale = max(1.0, 2.0 * at.cost / max(1, rows_told - 12))
+        sigma = np.sqrt(np.diag(at.covariance)[6:])
+        tie = np.abs(at.covariance[6:9, 9:] / np.maximum(np.outer(sigma[:3], sigma[3:]), 1e-300)).max()
+        told = not any(h.startswith("flange_T_tool") for h in at.held) and np.sqrt(scale) * sigma[3:].max() < CARRIED
+        if told and tie < TIED:
+            out.append(replace(i, tool=free))
+            notes.append(f"instrument '{i.name}': its points tell the orientation of the sensor, which is identified")
+        else:
+            out.append(i)
+            notes.append(
+                f"instrument '{i.name}': its points do not tell the orientation of the sensor from its place: "
+                "flange_T_tool.rpy_deg is held as stated"
+            )
+    return out, notes
 
 
 def length_alarms(found: IdentifiedInstruments) -> list[str]:

@@ -17,7 +17,7 @@ from tests.calibration.scenarios import scenario
 def test_kept_out_poses_agree_with_the_stated_uncertainty() -> None:
     s = scenario(0)
     observed = s.frames(s.poses)
-    robot = identify(s.model, s.poses, [observed], kernel=s.kernel)
+    robot = identify(s.model, s.poses, [observed])
     result = verify(robot, s.kept_out, [s.frames(s.kept_out)], fit_nominal(s.model, s.poses, [observed]))
     assert result.kind == "verify-set"
     assert result.poses == 200
@@ -52,14 +52,14 @@ def test_repetitions_give_rp_and_stay_in_one_fold() -> None:
     labels = repetitions(q)
     assert len(np.unique(labels)) == 30
     observed = s.frames(poses)
-    result = cross_validate(s.model, poses, [observed], folds=3, kernel=s.kernel)
+    result = cross_validate(s.model, poses, [observed], folds=3)
     assert result.kind == "cross-validation"
     assert sorted(result.rows.tolist()) == list(range(90))
     assert result.iso is not None
     assert 5e-5 < result.iso.rp_mean < 5e-4
     assert 0.85 < result.coverage_95 <= 1.0
     with pytest.raises(NotIdentifiable, match="folds"):
-        cross_validate(s.model, poses.subset(np.arange(6)), [observed.subset(np.arange(6))], folds=5, kernel=s.kernel)
+        cross_validate(s.model, poses.subset(np.arange(6)), [observed.subset(np.arange(6))], folds=5)
 
 
 def test_points_alone_and_empty_statistics() -> None:

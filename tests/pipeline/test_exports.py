@@ -16,7 +16,7 @@ import pytest
 from fixtures.campaigns import make_campaign
 from pipeline.artifacts import IDENTIFICATION
 from pipeline.exports import export_run
-from pipeline.prediction import compensate_run, predict_run
+from pipeline.prediction import CompensateOptions, compensate_run, predict_run
 from pipeline.runner import run_campaign
 from pipeline.runs import open_run
 from pipeline.stages.identify import load_calibrated
@@ -95,7 +95,7 @@ def test_programs_of_controllers(
     campaign, run = finished
     predict_run(run, campaign / "poses.csv", tmp_path / "wanted.csv")
     out = tmp_path / "2 parts.txt"
-    answer = compensate_run(run, tmp_path / "wanted.csv", out, as_frames=as_frames, program=dialect)
+    answer = compensate_run(run, tmp_path / "wanted.csv", out, CompensateOptions(as_frames=as_frames, program=dialect))
     assert sum(word in line for line in out.read_text().splitlines()) == answer["frames"] == 50
     assert "robcal_2_parts" in out.read_text()
 
@@ -104,7 +104,7 @@ def test_an_unknown_controller_is_refused(finished: tuple[Path, Path], tmp_path:
     campaign, run = finished
     predict_run(run, campaign / "poses.csv", tmp_path / "wanted.csv")
     with pytest.raises(InvalidInput, match="krl, rapid or urscript"):
-        compensate_run(run, tmp_path / "wanted.csv", tmp_path / "o", program="karel")
+        compensate_run(run, tmp_path / "wanted.csv", tmp_path / "o", CompensateOptions(program="karel"))
 
 
 def test_targets_of_programs_are_base_coordinates_whatever_the_frames_were_given_in(
@@ -115,7 +115,7 @@ def test_targets_of_programs_are_base_coordinates_whatever_the_frames_were_given
     predict_run(run, campaign / "poses.csv", tmp_path / "wanted.csv")
     compensate_run(run, tmp_path / "wanted.csv", tmp_path / "q.csv")
     out = tmp_path / "part.script"
-    compensate_run(run, tmp_path / "wanted.csv", out, as_frames=True, program="urscript")
+    compensate_run(run, tmp_path / "wanted.csv", out, CompensateOptions(as_frames=True, program="urscript"))
     robot = load_calibrated(open_run(run))
     table = read_table(tmp_path / "q.csv")
     q = np.radians(np.column_stack([table.numbers(f"q{k}_deg") for k in range(1, 7)]))

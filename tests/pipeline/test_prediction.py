@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from fixtures.campaigns import make_campaign
-from pipeline.prediction import compensate_run, predict_run
+from pipeline.prediction import CompensateOptions, compensate_run, predict_run
 from pipeline.runner import run_campaign
 from robcal.errors import InvalidInput
 from robcal.files.tables import read_table
@@ -68,7 +68,7 @@ def test_defaults_of_poses_to_predict(finished: tuple[Path, Path], tmp_path: Pat
 def test_commands_bring_the_predicted_tool_to_the_wanted_frame(finished: tuple[Path, Path], tmp_path: Path) -> None:
     campaign, run = finished
     predict_run(run, campaign / "poses.csv", tmp_path / "wanted.csv")
-    done = compensate_run(run, tmp_path / "wanted.csv", tmp_path / "q.csv", skip_unreachable=True)
+    done = compensate_run(run, tmp_path / "wanted.csv", tmp_path / "q.csv", CompensateOptions(skip_unreachable=True))
     assert done["frames"] > 0.9 * 80
     predict_run(run, tmp_path / "q.csv", tmp_path / "reached.csv")
     wanted, reached = positions(tmp_path / "wanted.csv"), positions(tmp_path / "reached.csv")
@@ -81,8 +81,10 @@ def test_corrected_targets_make_the_nominal_robot_take_the_same_joint_angles(
 ) -> None:
     campaign, run = finished
     predict_run(run, campaign / "poses.csv", tmp_path / "wanted.csv")
-    compensate_run(run, tmp_path / "wanted.csv", tmp_path / "q.csv", skip_unreachable=True)
-    compensate_run(run, tmp_path / "wanted.csv", tmp_path / "f.csv", as_frames=True, skip_unreachable=True)
+    compensate_run(run, tmp_path / "wanted.csv", tmp_path / "q.csv", CompensateOptions(skip_unreachable=True))
+    compensate_run(
+        run, tmp_path / "wanted.csv", tmp_path / "f.csv", CompensateOptions(as_frames=True, skip_unreachable=True)
+    )
     targets = positions(tmp_path / "f.csv")
     wanted = positions(tmp_path / "wanted.csv")
     shift = [np.linalg.norm(targets[name] - wanted[name]) for name in targets]

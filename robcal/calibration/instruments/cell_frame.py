@@ -4,7 +4,7 @@ Coordinates are x, y, z along the axes of the outer frame and roll, pitch, yaw, 
 known; an end of which nothing is known is perturbed on the right, which has no singular orientation.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -27,6 +27,7 @@ class CellFrame:
     name : of the instrument that it belongs to; its parameters are ``<name>.<end>.<x..yaw>``.
     given : (6,) x, y, z (m), roll, pitch, yaw (rad), NaN where nothing is stated.
     sigma : (6,) standard deviation of what is given: 0 is known, infinite is free.
+    certified : whether the angles are held only as long as the measurements do not tell them better.
 
     Raises
     ------
@@ -37,6 +38,7 @@ class CellFrame:
     end: str
     given: tuple[float, ...] = (np.nan,) * 6
     sigma: tuple[float, ...] = (FREE,) * 6
+    certified: bool = False
 
     def __post_init__(self) -> None:
         for kind, value, sigma in zip(GEOMETRIC_KINDS, self.given, self.sigma, strict=True):
@@ -106,6 +108,10 @@ class CellFrame:
         if not self._by_angles and np.all(np.isfinite(given[3:])):
             out[3:] = tf.log_so3(tf.rotation_from_rpy(given[3:]).T @ T[:3, :3])
         return np.where(np.isfinite(self.sigma), out, 0.0)
+
+    def with_free_angles(self) -> "CellFrame":
+        """The same with angles of which the given ones are start values."""
+        return replace(self, sigma=(*self.sigma[:3], FREE, FREE, FREE), certified=False)
 
     def start(self, T: Array, *, stated: bool = False) -> Array:
         """A frame (4, 4) with the coordinates that are known put in; ``stated`` : also those given as start values."""

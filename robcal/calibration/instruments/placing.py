@@ -162,7 +162,8 @@ def coordinate_title(name: str) -> str:
 def _starts(part: Part, base_T_flange: Array, located: Mapping[str, Array]) -> list[Pair]:
     """Pairs of frames worth trying: constructed from the measurements, and as stated."""
     stated = part.tool.start(np.eye(4), stated=True)
-    made = candidates(base_T_flange, part.observations, stated)
+    turn = stated[:3, :3] if np.isfinite(part.tool.given[3:]).all() else None
+    made = candidates(base_T_flange, part.observations, stated, turn)
     pairs = [(part.world.start(W), part.tool.start(F)) for W, F in made]
     world, tool = part.world.parameter_names[0], part.tool.parameter_names[0]
     if world in located or np.isfinite(part.world.given).any():

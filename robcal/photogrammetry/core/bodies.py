@@ -14,6 +14,8 @@ IntArray = NDArray[np.int64]
 
 _PLANE_RATIO = 0.02
 """A body whose thickness is below this share of its width is treated as a plane (two-fold resection)."""
+_ON_SPHERE = 0.02
+"""Radii of a sphere's targets may differ by this share of it."""
 
 
 @dataclass(frozen=True)
@@ -121,10 +123,7 @@ class Body:
         if self.is_plane():
             out[:] = np.linalg.svd(centred)[2][2]
         elif len(p) >= 8:
-            # algebraic sphere: |p|^2 = 2 p.c + (r^2 - c^2)
-            design = np.column_stack([2.0 * centred, np.ones(len(p))])
-            solution = np.linalg.lstsq(design, np.sum(centred**2, axis=1), rcond=None)[0]
-            rays = centred - solution[:3]
+            rays = centred - _sphere_centre(centred)
             radii = np.linalg.norm(rays, axis=1)
             width = float(np.median(np.linalg.norm(p - np.median(p, axis=0), axis=1)))
             if np.std(radii) < 0.02 * min(float(np.mean(radii)), width):
@@ -136,6 +135,36 @@ class Body:
         if self.covariance is None:
             return np.zeros((3, 3))
         return self.covariance[3 * row : 3 * row + 3, 3 * row : 3 * row + 3]
+
+
+def fit_sphere(points: ArrayLike, name: str = "") -> tuple[Array, float]:
+    """Centre (3,) and radius (m) of the sphere through points (n, 3), by algebraic least squares.
+
+    Raises
+    ------
+    InvalidInput : fewer than four points, points in a plane, or points that are on no sphere.
+    """
+    p = np.asarray(points, dtype=float)
+    told = f"body '{name}'" if name else "the body"
+    if len(p) < 4 or thickness_ratio(p) < _PLANE_RATIO:
+        raise InvalidInput(f"{told} is no sphere: at least four targets with coordinates that are not in a plane")
+    middle = p.mean(axis=0)
+    centre = middle + _sphere_centre(p - middle)
+    radii = np.linalg.norm(p - centre, axis=1)
+    radius = float(radii.mean())
+    if np.ptp(radii) > _ON_SPHERE * radius:
+        worst = int(np.argmax(np.abs(radii - radius)))
+        raise InvalidInput(
+            f"{told} is no sphere: its targets are {1e3 * radii.min():.2f} to {1e3 * radii.max():.2f} mm from one "
+            f"centre (row {worst + 1} of its targets is farthest off): check the coordinates"
+        )
+    return centre, radius
+
+
+def _sphere_centre(p: Array) -> Array:
+    """Centre of the algebraic sphere ``|p|^2 = 2 p.c + (r^2 - c^2)`` through points (n, 3)."""
+    design = np.column_stack([2.0 * p, np.ones(len(p))])
+    return np.asarray(np.linalg.lstsq(design, np.sum(p**2, axis=1), rcond=None)[0][:3])
 
 
 def thickness_ratio(points: ArrayLike) -> float:

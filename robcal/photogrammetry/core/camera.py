@@ -34,6 +34,11 @@ class Camera:
     k3: float = 0.0
 
     @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the intrinsic parameters in the order of the vector."""
+        return INTRINSIC_NAMES
+
+    @property
     def vector(self) -> Array:
         """The intrinsic parameters (9,) in the order of :data:`INTRINSIC_NAMES`."""
         return np.array([getattr(self, name) for name in INTRINSIC_NAMES], dtype=float)

@@ -13,8 +13,8 @@ from robcal.imaging.detections import Detections, TargetKind
 from robcal.photogrammetry.core.bodies import Body, IntArray
 from robcal.photogrammetry.core.camera import Camera, project_with_jacobians
 from robcal.photogrammetry.core.eccentricity import effective_point
+from robcal.photogrammetry.identify.dots import match_dots
 from robcal.photogrammetry.identify.grow import View
-from robcal.photogrammetry.identify.search import match_dots
 from robcal.photogrammetry.orientation.resection import PoseFit, TargetMarks, refine_poses
 from robcal.transforms import Array, skew, transform
 

@@ -12,8 +12,9 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial import cKDTree
 
-from robcal.photogrammetry.core.bodies import Body, IntArray
+from robcal.photogrammetry.core.bodies import IntArray
 from robcal.photogrammetry.core.camera import Camera
+from robcal.photogrammetry.identify.dots import Dots
 from robcal.photogrammetry.identify.grow import (
     Grown,
     View,
@@ -108,43 +109,35 @@ def has_rows(points: Array) -> bool:
 
 
 def search_grid(
-    camera: Camera,
-    xy: Array,
-    size: Array,
-    contrast: Array,
-    body: Body,
-    candidates: IntArray,
-    *,
-    model_error_px: float,
-    others: Sequence[View] = (),
+    camera: Camera, dots: Dots, points: Array, *, model_error_px: float, others: Sequence[View] = ()
 ) -> tuple[list[Grown], str]:
-    """Numberings (targets are rows of ``candidates``) that cannot be distinguished, the best first; else a reason.
+    """Numberings (targets are rows of ``points``) that cannot be distinguished, the best first; else a reason.
 
     Parameters
     ----------
-    xy, size, contrast : (m, 2), (m,), (m,) of the image's dots. candidates : body rows that may appear.
+    dots : of the image. points : (n, 3) m, body coordinates of the targets that may appear.
     model_error_px : error that the camera's start values may cause along two rows.
-    others : what cameras of known numbering see of the same body at the same time (by row of ``candidates``).
+    others : what cameras of known numbering see of the same body at the same time (by row of ``points``).
     """
-    points = body.points[candidates]
     rows = body_rows(points)
-    if len(rows) < 2 or len(xy) < _MIN_TARGETS:
+    if len(rows) < 2 or len(dots) < _MIN_TARGETS:
         return [], _REASON
-    chains = image_rows(xy, size, contrast, longest_step=0.12 * float(np.hypot(camera.width, camera.height)))
+    chains = image_rows(dots, longest_step=0.12 * float(np.hypot(camera.width, camera.height)))
     if len(chains) < 2:
         return [], f"{len(chains)} rows of dots in the image, two are needed"
     tolerance = model_error_px + 2.0
     best: Grown | None = None
     best_score = -np.inf
-    for poses, used in row_hypotheses(camera, xy, points, rows, chains, tolerance):
-        own = _like(size, contrast, used)
-        tree = cKDTree(xy[own])
+    for poses, used in row_hypotheses(camera, dots.xy, points, rows, chains, tolerance):
+        own = _like(dots, used)
+        near = dots.xy[own]
+        tree = cKDTree(near)
         score = np.concatenate(list(rough_scores(camera, poses, points, tree, 2.0 * tolerance)))
         for k in np.argsort(-score, kind="stable")[:_GROWN]:
-            found = grow(camera, poses[k], points, xy[own], reach=2.0 * tolerance, tree=tree)
+            found = grow(camera, poses[k], points, near, reach=2.0 * tolerance, tree=tree)
             if found is None or found.rms > tolerance:
                 continue
-            density = _density(xy[own][found.dots], xy[own])
+            density = _density(near[found.dots], near)
             value = log_odds(found, points, sigma=usual_error(found.off), density=density)
             if value > best_score:
                 best_score, best = value, _renumbered(found, own)
@@ -156,11 +149,12 @@ def search_grid(
     believed, why = _believed(best, len(points), best_score)
     if not believed:
         return [], why
-    return _with_rivals(camera, xy, size, contrast, points, best, tolerance, others), ""
+    return _with_rivals(camera, dots, points, best, tolerance, others), ""
 
 
-def _like(size: Array, contrast: Array, used: IntArray) -> IntArray:
+def _like(dots: Dots, used: IntArray) -> IntArray:
     """Rows of the dots that look like those of two chains."""
+    size, contrast = dots.size, dots.contrast
     near = np.abs(np.log(size / np.median(size[used]))) < np.log(2.2)
     near &= np.abs(np.log(np.abs(contrast) / np.median(np.abs(contrast[used])))) < np.log(4.0)
     near[used] = True
@@ -190,27 +184,21 @@ def _believed(found: Grown, n: int, value: float) -> tuple[bool, str]:
 
 
 def _with_rivals(
-    camera: Camera,
-    xy: Array,
-    size: Array,
-    contrast: Array,
-    points: Array,
-    best: Grown,
-    tolerance: float,
-    others: Sequence[View],
+    camera: Camera, dots: Dots, points: Array, best: Grown, tolerance: float, others: Sequence[View]
 ) -> list[Grown]:
     """The best numbering, after trying all that the body's shape allows, and those it does not clearly beat."""
-    own = _like(size, contrast, best.dots)
-    tree = cKDTree(xy[own])
+    own = _like(dots, best.dots)
+    near = dots.xy[own]
+    tree = cKDTree(near)
     pool = [best]
     for motion in congruences(points, best.targets):
         start = best.camera_T_body @ invert(motion)
-        rival = grow(camera, start, points, xy[own], reach=tolerance, tree=tree, lens=best.camera)
+        rival = grow(camera, start, points, near, reach=tolerance, tree=tree, lens=best.camera)
         if rival is not None:
             pool.append(_renumbered(rival, own))
     pool = [without_stragglers(f) for f in pool]
     sigma = min(usual_error(f.off) for f in pool if len(f.dots) >= 0.9 * max(len(g.dots) for g in pool))
-    density = _density(xy[best.dots], xy[own])
+    density = _density(dots.xy[best.dots], near)
     value = [log_odds(f, points, sigma=sigma, density=density, others=others) for f in pool]
     order = np.argsort([-v for v in value], kind="stable")
     first = pool[order[0]]

@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 
+from robcal.estimation.levenberg import Linearised, levenberg
+from robcal.estimation.summary import TerminationSettings
 from robcal.photogrammetry.core.bodies import IntArray, line_ratio
 from robcal.photogrammetry.core.camera import INTRINSIC_NAMES, Camera, project, project_with_jacobians
 from robcal.transforms import Array, retract, skew, transform
@@ -81,9 +83,12 @@ def grow(
     return before
 
 
+_PoseAndLens = tuple[Array, Camera]
+
+
 def refine_with_lens(
     start: Camera, camera: Camera, camera_T_body: Array, points: Array, xy: Array, *, scale: float, iterations: int = 15
-) -> tuple[Array, Camera]:
+) -> _PoseAndLens:
     """Pose, common focal factor, k1, p1 and p2 of one image from matched dots (Cauchy weights of width ``scale`` px).
 
     The four numbers of the lens are held to ``start`` by weak priors, since one image of a rather flat body hardly
@@ -91,52 +96,47 @@ def refine_with_lens(
     """
     corner = np.hypot(start.width / start.fx, start.height / start.fy) / 2.0
     prior = 1.0 / np.array([_SIGMA_LOG_FOCAL, _RADIAL / corner**2, _DECENTRED / corner, _DECENTRED / corner])
-    pose = camera_T_body
 
-    def cost(p: Array, c: Camera) -> float:
-        s = np.sum(((xy - project(c, transform(p, points))) / scale) ** 2, axis=1)
-        if not np.isfinite(s).all():
-            return np.inf
-        return float(np.sum(np.log1p(s)) + np.sum((prior * _lens_off(start, c)) ** 2))
+    def cost(state: _PoseAndLens) -> float:
+        pose, lens = state
+        s = np.sum(((xy - project(lens, transform(pose, points))) / scale) ** 2, axis=1)
+        return 0.5 * float(np.sum(np.log1p(s)) + np.sum((prior * _lens_off(start, lens)) ** 2))
 
-    damping, value = 1e-4, cost(pose, camera)
-    lens = np.arange(6, 10)
-    for _ in range(iterations):
-        predicted, d_point, d_lens = project_with_jacobians(camera, transform(pose, points))
-        R = pose[:3, :3]
-        by_pose = d_point @ np.concatenate([np.broadcast_to(R, (len(points), 3, 3)), -R @ skew(points)], axis=-1)
-        by_focal = d_lens[:, :, _AT["fx"]] * camera.fx + d_lens[:, :, _AT["fy"]] * camera.fy
-        by_rest = d_lens[:, :, [_AT["k1"], _AT["p1"], _AT["p2"]]]
-        J = np.concatenate([by_pose, by_focal[..., None], by_rest], axis=-1) / scale
-        r = (xy - predicted) / scale
+    def linearise(state: _PoseAndLens) -> Linearised[_PoseAndLens]:
+        pose, lens = state
+        r, J = _whitened(pose, lens, points, xy, scale)
         weight = 1.0 / (1.0 + np.sum(r**2, axis=1))
-        weighted = J * weight[:, None, None]
-        N = np.tensordot(weighted, J, axes=((0, 1), (0, 1)))
-        g = np.tensordot(weighted, r, axes=((0, 1), (0, 1)))
-        N[lens, lens] += prior**2
-        g[lens] -= prior**2 * _lens_off(start, camera)
-        step = np.linalg.solve(N + damping * np.diag(np.diag(N)) + 1e-30 * np.eye(10), g)
-        factor = float(np.exp(np.clip(step[6], -0.2, 0.2)))
-        trial_pose = retract(pose, step[:6])
-        trial = replace(
-            camera,
-            fx=camera.fx * factor,
-            fy=camera.fy * factor,
-            k1=camera.k1 + float(step[7]),
-            p1=camera.p1 + float(step[8]),
-            p2=camera.p2 + float(step[9]),
-        )
-        trial_value = cost(trial_pose, trial)
-        if trial_value <= value:
-            gain = value - trial_value
-            pose, camera, value, damping = trial_pose, trial, trial_value, damping * 0.2
-            if gain < 1e-5 * (1e-3 + value):
-                break
-        else:
-            damping = max(damping, 1e-4) * 10.0
-            if damping > 1e6:
-                break
-    return pose, camera
+        N = np.tensordot(J * weight[:, None, None], J, axes=((0, 1), (0, 1)))
+        g = np.tensordot(J * weight[:, None, None], r, axes=((0, 1), (0, 1)))
+        held = np.arange(6, 10)
+        N[held, held] += prior**2
+        g[held] -= prior**2 * _lens_off(start, lens)
+
+        def propose(damping: float) -> tuple[_PoseAndLens, float]:
+            step = np.linalg.solve(N + np.diag(damping * np.diag(N)), g)
+            return (retract(pose, step[:6]), _changed(lens, step[6:])), float(g @ step - 0.5 * step @ N @ step)
+
+        return Linearised(cost(state), propose, cost)
+
+    settings = TerminationSettings(iterations, cost_tolerance=1e-5)
+    return levenberg(linearise, (camera_T_body, camera), settings)[0]
+
+
+def _whitened(pose: Array, lens: Camera, points: Array, xy: Array, scale: float) -> tuple[Array, Array]:
+    """Residuals (n, 2) in units of ``scale`` and their derivatives (n, 2, 10) by pose, log focal length, k1, p1, p2."""
+    predicted, d_point, d_lens = project_with_jacobians(lens, transform(pose, points))
+    R = pose[:3, :3]
+    by_pose = d_point @ np.concatenate([np.broadcast_to(R, (len(points), 3, 3)), -R @ skew(points)], axis=-1)
+    by_focal = d_lens[:, :, _AT["fx"]] * lens.fx + d_lens[:, :, _AT["fy"]] * lens.fy
+    by_rest = d_lens[:, :, [_AT["k1"], _AT["p1"], _AT["p2"]]]
+    return (xy - predicted) / scale, np.concatenate([by_pose, by_focal[..., None], by_rest], axis=-1) / scale
+
+
+def _changed(lens: Camera, step: Array) -> Camera:
+    """The camera after a step (4,) of log focal length (at most 0.2), k1, p1, p2."""
+    factor = float(np.exp(np.clip(step[0], -0.2, 0.2)))
+    k1, p1, p2 = (float(v) for v in step[1:])
+    return replace(lens, fx=lens.fx * factor, fy=lens.fy * factor, k1=lens.k1 + k1, p1=lens.p1 + p1, p2=lens.p2 + p2)
 
 
 def _lens_off(start: Camera, camera: Camera) -> Array:

@@ -6,6 +6,7 @@ a line with slowly changing spacing, which the chains follow by extrapolating th
 """
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import lru_cache
 from itertools import combinations, pairwise
 
@@ -14,6 +15,7 @@ from scipy.spatial import cKDTree
 
 from robcal.photogrammetry.core.bodies import IntArray
 from robcal.photogrammetry.core.camera import Camera, normalise, project
+from robcal.photogrammetry.identify.dots import Dots
 from robcal.photogrammetry.orientation.p3p import three_point_poses
 from robcal.transforms import Array, transform
 
@@ -52,19 +54,20 @@ def body_rows(points: Array) -> list[IntArray]:
     return kept[:_MAX_ROWS]
 
 
-def image_rows(xy: Array, size: Array, contrast: Array, *, longest_step: float) -> list[IntArray]:
+def image_rows(dots: Dots, longest_step: float) -> list[IntArray]:
     """Chains of dots of like size and brightness at steadily changing spacing; -1 stands for a gap (one at a time).
 
     Parameters
     ----------
-    xy, size, contrast : (m, 2), (m,), (m,) of the dots. longest_step : px between two neighbours at most.
+    dots : of the image, m of them. longest_step : px between two neighbours at most.
 
     Returns
     -------
     Chains of five or more dots, the least accidental first (by the density of like dots around each), none largely a
     part of another.
     """
-    features = np.column_stack([np.log(size), np.log(np.maximum(np.abs(contrast), 1e-9))])
+    xy, size = dots.xy, dots.size
+    features = np.column_stack([np.log(size), np.log(np.maximum(np.abs(dots.contrast), 1e-9))])
     tree = cKDTree(xy)
     pairs = tree.query_pairs(longest_step, output_type="ndarray").reshape(-1, 2)
     step = np.linalg.norm(xy[pairs[:, 1]] - xy[pairs[:, 0]], axis=1)
@@ -91,18 +94,18 @@ def image_rows(xy: Array, size: Array, contrast: Array, *, longest_step: float) 
         chain = _follow(tree, xy, features, _follow(tree, xy, features, [int(i) for i in start])[::-1])
         done.update(pairwise(chain))
         done.update(pairwise(chain[::-1]))
-        dots = np.array([i for i in chain if i >= 0])
-        pitch = float(np.linalg.norm(xy[dots[-1]] - xy[dots[0]])) / (len(chain) - 1)
-        by_chance = np.minimum(density[dots] * np.pi * _gate(pitch) ** 2, 0.9)
+        real = np.array([i for i in chain if i >= 0])
+        pitch = float(np.linalg.norm(xy[real[-1]] - xy[real[0]])) / (len(chain) - 1)
+        by_chance = np.minimum(density[real] * np.pi * _gate(pitch) ** 2, 0.9)
         # two dots make the pair; a gap is a second chance
-        surprise = float(-np.sort(np.log(by_chance))[::-1][2:].sum()) - 0.7 * (len(chain) - len(dots))
-        if len(dots) >= _MIN_ROW and surprise > needed:
+        surprise = float(-np.sort(np.log(by_chance))[::-1][2:].sum()) - 0.7 * (len(chain) - len(real))
+        if len(real) >= _MIN_ROW and surprise > needed:
             found.append((surprise, np.array(chain, dtype=np.int64)))
     found.sort(key=lambda item: -item[0])
     kept: list[IntArray] = []
-    for _, dots in found:
-        if not any(np.isin(dots, other).mean() > 0.5 for other in kept):
-            kept.append(dots)
+    for _, candidate in found:
+        if not any(np.isin(candidate, other).mean() > 0.5 for other in kept):
+            kept.append(candidate)
     return kept[:_MAX_CHAINS]
 
 
@@ -148,13 +151,13 @@ def row_hypotheses(
     pose is dropped; the camera's start values need only be good to this along two rows.
     """
     ideal = normalise(camera, xy)
-    overlaps = [[_overlaps(chain, row) for row in rows] for chain in chains]
+    pairings = [[_Pairing(chain, row, tuple(_overlaps(chain, row))) for row in rows] for chain in chains]
     order = sorted(combinations(range(len(chains)), 2), key=lambda pair: (pair[1], pair[0]))
     for one, two in order:
         laid = [
-            _laid(xy, chains[one], chains[two], points, rows[i], rows[j], overlaps[one][i], overlaps[two][j])
-            for i in range(len(rows))
-            for j in range(len(rows))
+            _laid(xy, points, first, second)
+            for i, first in enumerate(pairings[one])
+            for j, second in enumerate(pairings[two])
             if i != j
         ]
         dots = np.concatenate([d for d, _ in laid])
@@ -172,17 +175,18 @@ def row_hypotheses(
             yield np.concatenate(poses), np.unique(both[both >= 0])
 
 
-def _laid(
-    xy: Array,
-    one: IntArray,
-    two: IntArray,
-    points: Array,
-    first: IntArray,
-    second: IntArray,
-    on_first: list[_Overlap],
-    on_second: list[_Overlap],
-) -> tuple[IntArray, IntArray]:
+@dataclass(frozen=True)
+class _Pairing:
+    """A chain of dots, a row of targets, and all ways to lay one on the other."""
+
+    chain: IntArray
+    row: IntArray
+    overlaps: tuple[_Overlap, ...]
+
+
+def _laid(xy: Array, points: Array, one_on: _Pairing, two_on: _Pairing) -> tuple[IntArray, IntArray]:
     """Five dots (ends of the first chain; ends and middle of the second) and their targets (k, 5), for all offsets."""
+    one, two, first, second = one_on.chain, two_on.chain, one_on.row, two_on.row
     u, v = points[first[-1]] - points[first[0]], points[second[-1]] - points[second[0]]
     p, q = xy[one[-1]] - xy[one[0]], xy[two[-1]] - xy[two[0]]
     cross = float(u @ v / (np.linalg.norm(u) * np.linalg.norm(v)))
@@ -194,8 +198,8 @@ def _laid(
         body = np.linalg.norm(u) / (len(first) - 1) / (np.linalg.norm(v) / (len(second) - 1))
         if abs(turned) < 0.8 or not 0.6 < image / body < 1.7:
             return np.empty((0, 5), dtype=np.int64), np.empty((0, 5), dtype=np.int64)
-    for at_one, named_one, sign_one in on_first:
-        for at_two, named_two, sign_two in on_second:
+    for at_one, named_one, sign_one in one_on.overlaps:
+        for at_two, named_two, sign_two in two_on.overlaps:
             # parallel rows point the same way in the image, too
             if abs(cross) > 0.99 and turned * sign_one * sign_two * cross < 0:
                 continue

@@ -6,16 +6,16 @@ numbering explains the dots as well: a symmetric arrangement is refused, not gue
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations, permutations
 
 import numpy as np
 from scipy import stats
-from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 
 from robcal.photogrammetry.core.bodies import Body, IntArray, spans_plane
 from robcal.photogrammetry.core.camera import Camera, normalise, project
+from robcal.photogrammetry.identify.dots import Dots, match_dots
 from robcal.photogrammetry.orientation.p3p import three_point_poses
 from robcal.photogrammetry.orientation.resection import TargetMarks, refine_poses
 from robcal.transforms import Array, transform
@@ -41,9 +41,7 @@ class Found:
 
 def search_body(
     camera: Camera,
-    xy: Array,
-    covariance: Array,
-    semi_major: Array,
+    dots: Dots,
     body: Body,
     candidates: IntArray,
     *,
@@ -54,8 +52,7 @@ def search_body(
 
     Parameters
     ----------
-    xy, covariance, semi_major : (m, 2), (m, 2, 2), (m,) of the image's dots.
-    candidates : body rows that may appear (uncoded, with coordinates).
+    dots : of the image, m of them. candidates : body rows that may appear (uncoded, with coordinates).
     model_error_px : error the camera's start values cause.
     max_hypotheses : three-point problems at most; triples of dots of similar size are tried first.
 
@@ -63,34 +60,34 @@ def search_body(
     -------
     Believable numberings (two or more: ambiguous) and, where there is none, the reason.
     """
-    n, m = len(candidates), len(xy)
+    n, m = len(candidates), len(dots)
+    points, diameters, semi_major = body.points[candidates], body.diameters[candidates], dots.semi_axes[:, 0]
     if n < 4:
         return [], f"{n} uncoded targets with coordinates cannot be distinguished by geometry; four or more are needed"
     if m < 4:
         return [], f"only {m} dots in the image"
-    if not spans_plane(body.points[candidates]):
+    if not spans_plane(points):
         return [], "the targets lie in one line"
-    ideal = normalise(camera, xy)
-    tree = cKDTree(xy)
+    ideal = normalise(camera, dots.xy)
+    tree = cKDTree(dots.xy)
     tolerance = 3.0 * model_error_px + 1.0
     tried = 0
     spare = _MORE_TRIPLES
     found: list[Found] = []
     why = "no arrangement of the dots fits the body"
-    for triple in _body_triples(body.points[candidates]):
-        base = candidates[list(triple)]
+    for triple in _body_triples(points):
+        base = list(triple)
         pool: list[tuple[float, Array]] = []
-        for dots in _dot_triples(semi_major, body.diameters[base]):
-            tried += len(dots)
-            points = np.broadcast_to(body.points[base], (len(dots), 3, 3))
-            poses = three_point_poses(ideal[dots], points)
-            poses = poses[_right_size(camera, poses, body.points[base], body.diameters[base], semi_major[dots])]
+        for three in _dot_triples(semi_major, diameters[base]):
+            tried += len(three)
+            poses = three_point_poses(ideal[three], np.broadcast_to(points[base], (len(three), 3, 3)))
+            poses = poses[_right_size(camera, poses, points[base], diameters[base], semi_major[three])]
             if len(poses):
-                pool += _best(camera, poses, xy, semi_major, tree, body, candidates, tolerance)
+                pool += _best(camera, poses, semi_major, tree, points, diameters, tolerance)
         pool = sorted(pool, key=lambda item: item[0])[:60]
         if pool:
-            more, why = _verify(camera, xy, covariance, body, candidates, pool, model_error_px, tried)
-            found += more
+            more, why = _verify(camera, dots, points, pool, model_error_px, tried)
+            found += [replace(f, targets=candidates[f.targets]) for f in more]
         # any other numbering that fits as well has this triple elsewhere in the image: it would be in the pool, too
         if any(len(f.rows) >= max(5, 0.6 * n) or len(f.rows) == n for f in found):
             if spare == 0:
@@ -156,21 +153,15 @@ def _dot_triples(semi_major: Array, diameters: Array) -> Iterator[IntArray]:
 
 
 def _best(
-    camera: Camera,
-    poses: Array,
-    xy: Array,
-    semi_major: Array,
-    tree: cKDTree,
-    body: Body,
-    candidates: IntArray,
-    tolerance: float,
+    camera: Camera, poses: Array, semi_major: Array, tree: cKDTree, points: Array, diameters: Array, tolerance: float
 ) -> list[tuple[float, Array]]:
-    p = transform(poses[:, None], body.points[candidates])
+    """Hypotheses by how well dots (in the ``tree``) stand where the points are predicted, with their scores."""
+    p = transform(poses[:, None], points)
     seen = project(camera, p)
     ok = np.asarray(np.isfinite(seen).all(axis=-1))
     distance, index = tree.query(np.where(ok[..., None], seen, -1e6), distance_upper_bound=tolerance)
-    size = camera.fx * 0.5 * body.diameters[candidates] / np.where(p[..., 2] > 0, p[..., 2], np.nan)
-    blob = semi_major[np.minimum(index, len(xy) - 1)]
+    size = camera.fx * 0.5 * diameters / np.where(p[..., 2] > 0, p[..., 2], np.nan)
+    blob = semi_major[np.minimum(index, len(semi_major) - 1)]
     with np.errstate(invalid="ignore"):
         wrong = (blob > 1.7 * size + 1.0) | (blob < size / 1.7 - 1.0)
     offset = np.where(np.isfinite(distance) & ~wrong, distance / tolerance, 1.0)
@@ -180,81 +171,46 @@ def _best(
     return [(float(score[k]), poses[k]) for k in top if matched[k] >= 4]
 
 
-def match_dots(
-    predicted: Array, gate: Array, xy: Array, usable: Array | None = None, *, unique: bool = True
-) -> tuple[IntArray, IntArray]:
-    """One-to-one matches of predicted (n, 2) and measured (m, 2) dots within a radius ``gate`` (n,) px.
-
-    Parameters
-    ----------
-    usable : (n, m) mask of admissible matches. unique : leave a target out when a second dot lies in its gate, and a
-        dot when two targets claim it.
-
-    Returns
-    -------
-    Rows of the targets and of the dots.
-    """
-    d = np.linalg.norm(predicted[:, None] - xy[None], axis=-1)
-    inside = (d <= gate[:, None]) & np.isfinite(d)
-    if usable is not None:
-        inside &= usable
-    if unique:
-        good = inside & (inside.sum(axis=1) == 1)[:, None] & (inside.sum(axis=0) == 1)[None]
-        rows, columns = np.nonzero(good)
-        return rows, columns
-    cost = np.where(inside, d / gate[:, None], 10.0)
-    rows, columns = linear_sum_assignment(cost)
-    keep = inside[rows, columns]
-    return rows[keep], columns[keep]
-
-
 def _verify(
-    camera: Camera,
-    xy: Array,
-    covariance: Array,
-    body: Body,
-    candidates: IntArray,
-    pool: list[tuple[float, Array]],
-    model_error_px: float,
-    tried: int,
+    camera: Camera, dots: Dots, points: Array, pool: list[tuple[float, Array]], model_error_px: float, tried: int
 ) -> tuple[list[Found], str]:
     """Refine the best hypotheses together, match again, and keep those that accidents would hardly produce."""
-    m, n = len(xy), len(candidates)
+    m, n = len(dots), len(points)
     area = float(camera.width * camera.height)
-    C = covariance + model_error_px**2 * np.eye(2)
+    C = dots.covariance + model_error_px**2 * np.eye(2)
     radius = np.full(n, 3.0 * model_error_px + 1.0)
     poses = np.array([pose for _, pose in pool])
     cost = np.zeros(len(poses))
     matches: list[tuple[IntArray, IntArray]] = []
     for _ in range(3):
-        predicted = project(camera, transform(poses[:, None], body.points[candidates]))
+        predicted = project(camera, transform(poses[:, None], points))
         unique: dict[bytes, int] = {}
         matches = []
         for k, places in enumerate(predicted):
-            targets, rows = match_dots(places, radius, xy, unique=False)
+            targets, rows = match_dots(places, radius, dots.xy, unique=False)
             key = np.stack([targets, rows]).tobytes()
-            enough = len(rows) >= 4 and spans_plane(body.points[candidates[targets]])
+            enough = len(rows) >= 4 and spans_plane(points[targets])
             if enough and key not in unique:
                 unique[key] = k
                 matches.append((targets, rows))
         if not matches:
             return [], "no arrangement of the dots fits the body"
         which = np.repeat(np.arange(len(matches)), [len(r) for _, r in matches])
-        targets = candidates[np.concatenate([t for t, _ in matches])]
+        targets = np.concatenate([t for t, _ in matches])
         rows = np.concatenate([r for _, r in matches])
-        marks = TargetMarks(body.points[targets], xy[rows], C[rows])
+        marks = TargetMarks(points[targets], dots.xy[rows], C[rows])
         fit = refine_poses(poses[list(unique.values())], which, marks, camera, iterations=10)
         poses, cost = fit.reference_T_body, fit.cost
     found: list[Found] = []
     why = "no arrangement of the dots fits the body"
     for k, (own, rows) in enumerate(matches):
-        off = np.linalg.norm(project(camera, transform(poses[k], body.points[candidates[own]])) - xy[rows], axis=1)
+        off = np.linalg.norm(project(camera, transform(poses[k], points[own])) - dots.xy[rows], axis=1)
         reach = max(1.5 * float(np.sqrt(np.mean(off**2))), 0.5)
         chance = min(1.0, m * np.pi * reach**2 / area)
         # three matches are spent on the pose; a triple has two solutions in the mean
         accidents = 2.0 * tried * float(stats.binom.sf(len(rows) - 4, n - 3, chance))
         if accidents < _CHANCE:
-            found.append(Found(rows, candidates[own], poses[k], float(cost[k]), accidents))
+            found.append(Found(rows, own, poses[k], float(cost[k]), accidents))
         else:
             why = f"{len(rows)} of {n} targets fit, which {accidents:.2g} accidental arrangements would do as well"
     return found, why

@@ -10,6 +10,7 @@ from robcal.imaging.detections import Detections, TargetKind
 from robcal.photogrammetry.boards.layout import CIRCLE, CORNER
 from robcal.photogrammetry.core.bodies import Body, IntArray
 from robcal.photogrammetry.core.camera import Camera
+from robcal.photogrammetry.identify.dots import Dots
 from robcal.photogrammetry.identify.extension import IdentifiedImage, Prediction, Start, extended
 from robcal.photogrammetry.identify.grid import has_rows, search_grid
 from robcal.photogrammetry.identify.grow import View, view_of
@@ -85,7 +86,7 @@ def identify_images(
     return [
         image
         if image is not None
-        else _without_codes(images[k], body, camera, coded[k], expected[k], model_error_px, search, others)
+        else _without_codes(images[k], body, camera, coded[k], expected[k], model_error_px, others if search else None)
         for k, image in enumerate(out)
     ]
 
@@ -123,10 +124,9 @@ def _without_codes(
     coded: tuple[IntArray, IntArray],
     predictions: Sequence[Prediction],
     model_error_px: float,
-    search: bool,
-    others: Sequence[View],
+    others: Sequence[View] | None,
 ) -> IdentifiedImage:
-    """One image whose codes give no pose: by predictions, then by its geometry."""
+    """One image whose codes give no pose: by predictions, then by its geometry (not with ``others`` None)."""
     rows, ids = coded
     placed = body.known[body.index(ids)] if len(ids) else np.zeros(0, dtype=bool)
     best: IdentifiedImage | None = None
@@ -140,16 +140,14 @@ def _without_codes(
     dots = _free_dots(detections, rows)
     candidates = np.flatnonzero(body.known & ~np.isin(body.ids, ids) & _uncoded(body))
     reason = f"{len(ids)} coded targets read, too few for a pose"
-    if search and len(candidates) >= 4:
+    if others is not None and len(candidates) >= 4:
         if has_rows(body.points[candidates]) and len(dots) > len(candidates) // 2:
             grid = _from_rows(detections, body, camera, candidates, dots, model_error_px, others)
             if grid.method != "none" or grid.alternatives:
                 return _joined(rows, ids, grid)
         found, why = search_body(
             camera,
-            detections.xy[dots],
-            detections.covariance[dots],
-            detections.semi_axes[dots, 0],
+            Dots.of(detections, dots),
             body,
             candidates,
             model_error_px=model_error_px,
@@ -192,16 +190,8 @@ def _from_rows(
     others: Sequence[View],
 ) -> IdentifiedImage:
     """The search by rows of dots: one numbering, several (refused), or nothing with a reason."""
-    size = np.sqrt(detections.semi_axes[dots].prod(axis=1))
     found, why = search_grid(
-        camera,
-        detections.xy[dots],
-        size,
-        detections.contrast[dots],
-        body,
-        candidates,
-        model_error_px=model_error_px,
-        others=others,
+        camera, Dots.of(detections, dots), body.points[candidates], model_error_px=model_error_px, others=others
     )
     none = np.empty(0, dtype=np.int64)
     if len(found) != 1:

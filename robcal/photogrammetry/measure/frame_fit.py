@@ -33,7 +33,6 @@ def fit_frames(
     body: Body,
     station_jacobian: Array | None = None,
     station_covariance: Array | None = None,
-    iterations: int = 10,
 ) -> FrameFit:
     """Fit body_T onto points: weights from the points' noise plus the body's own (marginal) uncertainty.
 
@@ -72,7 +71,7 @@ def fit_frames(
         r, J, _, _ = whitened(frames, rows, place)
         return NormalEquations.of_rows(place, r, J, len(chosen))
 
-    T = minimise_each(equations, retract, T, TerminationSettings(iterations, negligible=1e-10)).state
+    T = minimise_each(equations, retract, T, TerminationSettings(10, negligible=1e-10)).state
     r, J, W, R = whitened(T, np.arange(len(index)), index)
     Q = np.linalg.inv(sum_by(index, np.swapaxes(J, -1, -2) @ J, n))
     K = Q[index] @ np.swapaxes(J, -1, -2) @ W
@@ -82,11 +81,19 @@ def fit_frames(
         G = sum_by(index, K @ station_jacobian, n)
         common += G @ station_covariance @ np.swapaxes(G, -1, -2)
     if body.covariance is not None:
-        t = len(body)
-        H = np.moveaxis(sum_by(index * t + row, -K @ R, n * t).reshape(n, t, 6, 3), 1, 2).reshape(n, 6, 3 * t)
-        # targets without coordinates have no covariance either and no part in any fit
-        common += H @ np.nan_to_num(body.covariance) @ np.swapaxes(H, -1, -2)
+        common += _from_body(-K @ R, index * len(body) + row, body.covariance, n)
     count = np.bincount(index, minlength=n)
     targets = tuple(tuple(int(body.ids[row[k]]) for k in g) for g in groups)
     chi2 = sum_by(index, np.sum(r**2, axis=1), n)
     return FrameFit(poses, T, noise, common, targets, chi2, (3 * count - 6).astype(np.int64))
+
+
+def _from_body(by_target: Array, place: IntArray, covariance: Array, n: int) -> Array:
+    """(n, 6, 6) what the body's covariance (3t, 3t) adds to n frames.
+
+    ``by_target`` (m, 6, 3): derivative of the frames by the target of each point; ``place`` (m,): frame * t + target.
+    """
+    t = len(covariance) // 3
+    H = np.moveaxis(sum_by(place, by_target, n * t).reshape(n, t, 6, 3), 1, 2).reshape(n, 6, 3 * t)
+    # targets without coordinates have no covariance either and no part in any fit
+    return np.asarray(H @ np.nan_to_num(covariance) @ np.swapaxes(H, -1, -2))

@@ -9,6 +9,7 @@ import pytest
 from robcal.errors import InvalidInput
 from robcal.files.body_file import body_from_file, read_body, write_body
 from robcal.photogrammetry.boards.layout import Board
+from robcal.photogrammetry.core.bodies import Body
 
 pytestmark = pytest.mark.unit
 
@@ -94,7 +95,8 @@ def test_body_file_of_a_board(tmp_path: Path) -> None:
 def test_surveyed_coordinates_stand_beside_the_layout(tmp_path: Path) -> None:
     board = Board("charuco", 4, 3, square=0.03, marker=0.02, dictionary="DICT_4X4_50")
     points = board.points() + 1e-4
-    write_body(tmp_path / "s.yaml", board.ids().tolist(), points, 1e-12 * np.eye(18), polarity="dark", board=board)
+    body = Body("b", board.ids(), points, 1e-12 * np.eye(18), polarity="dark")
+    write_body(tmp_path / "s.yaml", body, board=board)
     again = read_body(tmp_path / "s.yaml")
     assert again.board == board
     np.testing.assert_allclose(body_from_file("b", again).points, points, atol=1e-12)

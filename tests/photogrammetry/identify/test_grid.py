@@ -12,6 +12,7 @@ from robcal.imaging.detect import detect_targets
 from robcal.imaging.settings import DetectionSettings
 from robcal.photogrammetry.core.bodies import Body
 from robcal.photogrammetry.core.camera import Camera, project
+from robcal.photogrammetry.identify.dots import Dots
 from robcal.photogrammetry.identify.grid import congruences, has_rows, search_grid
 from robcal.photogrammetry.identify.grow import refine_with_lens
 from robcal.photogrammetry.identify.rows import body_rows, image_rows
@@ -36,6 +37,10 @@ def _steps(lopsided: bool) -> np.ndarray:
     return np.array(points)
 
 
+def _dots(xy, size, contrast):
+    return Dots(xy, np.zeros((len(xy), 2, 2)), np.column_stack([size, size]), contrast)
+
+
 def _picture(body, pose, rng, *, false=500, hidden=0.0, noise=0.1):
     xy = project(TRUE, transform(pose, body.points)) + rng.normal(size=(len(body), 2)) * noise
     shown = rng.random(len(body)) >= hidden
@@ -44,7 +49,7 @@ def _picture(body, pose, rng, *, false=500, hidden=0.0, noise=0.1):
     size = np.concatenate([np.full(shown.sum(), 4.0), np.exp(rng.normal(0.9, 0.5, false))])
     contrast = np.concatenate([rng.uniform(80, 120, shown.sum()), np.exp(rng.normal(4.2, 0.6, false))])
     order = rng.permutation(len(places))
-    return places[order], size[order], contrast[order], ids[order]
+    return _dots(places[order], size[order], contrast[order]), ids[order]
 
 
 @pytest.mark.parametrize("pose", [FRONT, BEHIND])
@@ -52,8 +57,8 @@ def test_stepped_body_among_many_false_dots(pose):
     rng = np.random.default_rng(7)
     points = _steps(lopsided=True)
     body = Body("steps", np.arange(1, len(points) + 1), points)
-    xy, size, contrast, ids = _picture(body, pose, rng, hidden=0.1)
-    found, why = search_grid(ROUGH, xy, size, contrast, body, np.arange(len(body)), model_error_px=4.0)
+    dots, ids = _picture(body, pose, rng, hidden=0.1)
+    found, why = search_grid(ROUGH, dots, body.points, model_error_px=4.0)
     assert len(found) == 1, why
     best = found[0]
     true = ids[best.dots]
@@ -65,8 +70,8 @@ def test_symmetric_steps_are_refused():
     rng = np.random.default_rng(8)
     points = _steps(lopsided=False)
     body = Body("steps", np.arange(1, len(points) + 1), points)
-    xy, size, contrast, _ = _picture(body, FRONT, rng, false=200)
-    found, _ = search_grid(ROUGH, xy, size, contrast, body, np.arange(len(body)), model_error_px=4.0)
+    dots, _ = _picture(body, FRONT, rng, false=200)
+    found, _ = search_grid(ROUGH, dots, body.points, model_error_px=4.0)
     assert len(found) == 2  # a half turn about z lays the body on itself
 
 
@@ -74,11 +79,9 @@ def test_false_dots_alone_are_refused():
     rng = np.random.default_rng(9)
     points = _steps(lopsided=True)
     body = Body("steps", np.arange(len(points)), points)
-    xy, size, contrast, ids = _picture(body, FRONT, rng, false=900)
+    dots, ids = _picture(body, FRONT, rng, false=900)
     keep = ids < 0
-    found, why = search_grid(
-        ROUGH, xy[keep], size[keep], contrast[keep], body, np.arange(len(body)), model_error_px=4.0
-    )
+    found, why = search_grid(ROUGH, dots.select(keep), body.points, model_error_px=4.0)
     assert not found
     assert "row" in why
 
@@ -94,7 +97,7 @@ def test_chain_follows_perspective_over_a_gap():
     s = np.delete(np.arange(14.0), 6)
     line = np.column_stack([100 + 50 * s / (1 + 0.01 * s), 300 + 9 * s / (1 + 0.01 * s)])
     xy = np.concatenate([line, rng.uniform(0, 1000, (150, 2))])
-    chain = image_rows(xy, np.full(len(xy), 3.0), np.full(len(xy), 50.0), longest_step=120.0)[0]
+    chain = image_rows(_dots(xy, np.full(len(xy), 3.0), np.full(len(xy), 50.0)), longest_step=120.0)[0]
     own = chain[chain >= 0]
     assert set(range(13)) <= set(own.tolist())
     assert np.sum(chain < 0) >= 1

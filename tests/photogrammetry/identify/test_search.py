@@ -8,7 +8,8 @@ import pytest
 
 from robcal.photogrammetry.core.bodies import Body
 from robcal.photogrammetry.core.camera import Camera, project
-from robcal.photogrammetry.identify.search import match_dots, search_body
+from robcal.photogrammetry.identify.dots import Dots, match_dots
+from robcal.photogrammetry.identify.search import search_body
 from robcal.transforms import Array, exp_so3, frame, transform
 
 CAMERA = Camera(2400, 1800, 3200.0, 3200.0, 1200.0, 900.0)
@@ -26,7 +27,8 @@ def _search(points: Array, extra: int = 0, candidates: Array | None = None) -> t
     body = Body("part", np.arange(len(points)) + 1, points)
     rows = np.arange(len(points)) if candidates is None else candidates
     covariance = np.tile(0.05**2 * np.eye(2), (len(xy), 1, 1))
-    found = search_body(CAMERA, xy[order], covariance, np.full(len(xy), np.nan), body, rows, model_error_px=0.5)
+    dots = Dots(xy[order], covariance, np.full((len(xy), 2), np.nan), np.ones(len(xy)))
+    found = search_body(CAMERA, dots, body, rows, model_error_px=0.5)
     return (*found, order)
 
 

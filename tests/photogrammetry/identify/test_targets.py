@@ -34,6 +34,7 @@ def _detections(body, camera, camera_T_body, coded, rng, distractors):
         xy=xy[order],
         covariance=np.tile(np.eye(2) * 4e-4, (len(xy), 1, 1)),
         semi_axes=np.column_stack([size, 0.8 * size])[order],
+        contrast=np.full(len(xy), 100.0),
         code=code[order],
         kind=np.where(code[order] >= 0, TargetKind.RING12, TargetKind.DOT),
     )
