@@ -9,6 +9,7 @@ from typing import TypeVar
 import numpy as np
 
 from pipeline.campaign_schema import FORMAT, CampaignEntry, InstrumentEntry, StationCameraEntry, SurveyEntry
+from pipeline.correction import module_file
 from pipeline.instrument_frames import cell_frames
 from robcal.calibration.instruments import CellFrame
 from robcal.errors import InvalidInput, RobcalError
@@ -338,6 +339,14 @@ class _Reader:
                 ("instruments", name, "pulley"),
                 f"instrument '{name}' has {table.kind}: a pulley belongs to distances, and its axis needs a direction",
             )
+        for key in ("tension_N", "correction"):
+            if getattr(use, key) is not None and table.kind != "distances":
+                raise self._error(
+                    ("instruments", name, key),
+                    f"instrument '{name}' has {table.kind}: '{key}' belongs to a wire's lengths",
+                )
+        if use.correction is not None:
+            self.files.extend(module_file(use.correction, self.path.parent))
 
     def _error(self, place: tuple[str | int, ...], message: str) -> InvalidInput:
         line = self.document.line(place)

@@ -148,11 +148,11 @@ class CellFrameEntry(Entry):
 
 
 class PulleyEntry(Entry):
-    """A wheel over which a wire leaves: held, not identified."""
+    """A wheel over which a wire leaves; its radius may be identified."""
 
     radius_mm: Positive
     axis: Triple = (0.0, 0.0, 1.0)
-    free: Literal["none"] = "none"
+    free: Literal["none", "radius"] = "none"
 
 
 class InstrumentEntry(Entry):
@@ -162,6 +162,8 @@ class InstrumentEntry(Entry):
     world_T_base: CellFrameEntry | None = None
     flange_T_tool: CellFrameEntry | None = None
     pulley: PulleyEntry | None = None
+    tension_N: Positive | None = None
+    correction: Text | None = None
     mounted: Literal["world", "hand"] = "world"
     body: Text | None = None
 

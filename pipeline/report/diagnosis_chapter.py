@@ -111,12 +111,14 @@ def _causes(causes: list[dict[str, Any]]) -> Table:
         place = f"{c.get('where')}" + (f", direction {c['direction']}" if c.get("direction") else "")
         change = f"{number(held.get('before'))} → {number(held.get('after'))} {unit}" if held else "–"
         explained = _share(c.get("explained"))
-        rows.append([k, said(c.get("cause")), place, numbers, probability(c.get("p_value")), explained, change])
+        force = "–" if c.get("in_force") is None else "yes" if c["in_force"] else f"no: {c['in_force_reason']}"
+        rows.append([k, said(c.get("cause")), place, numbers, probability(c.get("p_value")), explained, change, force])
     return table(
-        ["", "Cause", "Where", "Parameters ± sigma", "p", "Explains", "Error on kept-out data"],
+        ["", "Cause", "Where", "Parameters ± sigma", "p", "Explains", "Error on kept-out data", "In force"],
         rows,
-        "In the order in which they were accepted; the results of this run are already corrected for them.",
-        text=(0, 1, 2, 3),
+        "In the order in which they were accepted, each beside those before it and with all that the recording knows "
+        "(approach directions, times); the delivered robot has those that are in force.",
+        text=(0, 1, 2, 3, 7),
     )
 
 

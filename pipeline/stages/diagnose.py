@@ -70,7 +70,7 @@ def work(context: Context) -> Outcome:
         outputs.append(run.save(artifacts.CORRECTED, found.corrected))
     if found.placed is not None:
         outputs.append(run.save(artifacts.PLACED, found.placed))
-    told = [f.statement for f in images.findings] + [f.statement for f in diagnosis.findings]
+    told = [f.statement for f in images.findings] + [f.told for f in diagnosis.findings]
     told = [f"targets {x.targets[0]} and {x.targets[1]} exchanged in {len(x.poses)} pose(s)" for x in exchanges] + told
     notes = told or ["nothing missing: the model explains the data"]
     if diagnosis.findings:

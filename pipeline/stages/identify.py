@@ -10,7 +10,7 @@ from pipeline.campaign import Campaign
 from pipeline.instrument_results import instrument_notes, instruments_result
 from pipeline.runs import Run
 from pipeline.stages.base import Context, Outcome, Stage
-from pipeline.stages.observations import build_instruments, build_recording
+from pipeline.stages.observations import build_instruments, build_recording, corrections_of
 from pipeline.stages.survey import located
 from robcal.calibration.calibrated import CalibratedRobot
 from robcal.calibration.identification import IdentifiedRobot, IdentifyOptions
@@ -23,7 +23,8 @@ from robcal.files.robot_file import write_robot
 from robcal.files.schemas import proposal
 from robcal.photogrammetry.survey.given_coordinates import GivenCoordinates
 from robcal.recipe.identification import identify_robot
-from robcal.recipe.instruments import identify_from_instruments, leading_identification
+from robcal.recipe.instruments import leading_identification
+from robcal.recipe.wires import identify_with_corrections
 from robcal.robot.kernel import Kernel
 from robcal.robot.model import RobotModel
 
@@ -75,7 +76,9 @@ def _with_instruments(context: Context) -> Outcome:
     robot, poses = require_robot(campaign)
     options = options_of(campaign, stated=True)
     try:
-        found = identify_from_instruments(robot, poses, build_instruments(campaign, run), options)
+        found = identify_with_corrections(
+            robot, poses, build_instruments(campaign, run), corrections_of(campaign), options
+        )
     except InvalidInput as error:
         raise located(error, str(campaign.path)) from None
     leading = leading_identification(found)

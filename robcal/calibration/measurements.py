@@ -38,6 +38,7 @@ class RobotRecording:
     observations : for the identification; frames where the points of a pose carry one.
     detailed : for the diagnosis: the points themselves where there are some, else the same.
     stated : whether the measurements state their uncertainty.
+    weighted : factor on the stated sigmas (of positions) that the observations have, because these were contradicted.
     poses : (k,) rows of the poses that have observations.
     """
 
@@ -45,6 +46,7 @@ class RobotRecording:
     detailed: tuple[RobotObservations, ...]
     stated: bool
     notes: tuple[str, ...] = field(default=())
+    weighted: float = 1.0
 
     @property
     def poses(self) -> Rows:

@@ -67,7 +67,14 @@ class _Scatter:
 
 
 def noise_parts(
-    q: Array, residuals: Array, parameters: int, observations: Sequence[Observations], *, stated: bool, lever: float
+    q: Array,
+    residuals: Array,
+    parameters: int,
+    observations: Sequence[Observations],
+    *,
+    stated: bool,
+    lever: float,
+    weighted: float = 1.0,
 ) -> NoiseParts:
     """Split what is left of a robot.
 
@@ -77,15 +84,16 @@ def noise_parts(
         measured, in their order, m.
     parameters : number of fitted parameters. stated : whether the measurements state their uncertainty.
     lever : RMS way (m) of the measured place by one radian of scatter in every joint.
+    weighted : factor on the stated sigmas that the observations have, which are not believed unless it is one.
     """
     pose = np.concatenate([o.pose for o in observations])
     group = np.concatenate([_targets(o) for o in observations])
     labels = repetitions(q)
     pure = _within(residuals, np.column_stack([labels[pose], group]))
     repeats = int(len(np.unique(pose)) - len(np.unique(labels[pose])))
-    lengths = _lengths(observations)
-    told = float(np.sqrt(_stated(observations))) if stated else None
-    measurement, source, notes = _measurement(told, pure, lengths)
+    lengths = length_scatter(observations)
+    told = float(np.sqrt(stated_square(observations))) / weighted if stated else None
+    measurement, source, notes = _measurement(told, pure, lengths, refuted=weighted != 1.0)
     dimension = residuals.shape[1]
     freedom = max(1, len(residuals) * dimension - parameters)
     left = _Scatter(float(np.sum(residuals**2)) / freedom * dimension, freedom)
@@ -100,13 +108,17 @@ def noise_parts(
     return NoiseParts(measurement, source, told, scatter, lack, repeats, p, tuple(notes))
 
 
-def _measurement(told: float | None, pure: _Scatter | None, lengths: float | None) -> tuple[float, Source, list[str]]:
+def _measurement(
+    told: float | None, pure: _Scatter | None, lengths: float | None, *, refuted: bool = False
+) -> tuple[float, Source, list[str]]:
     """The measurement's noise from the first source that holds: stated, repetitions, lengths on the body."""
     repeated = None if pure is None else float(np.sqrt(pure.square))
     notes = []
     # repetitions hold the joints' scatter as well: they refute a stated noise only from above
     too_large = told is not None and repeated is not None and told > WRONG * repeated
-    wrong = too_large or (told is not None and lengths is not None and not 1 / WRONG < told / lengths < WRONG)
+    wrong = (
+        refuted or too_large or (told is not None and lengths is not None and not 1 / WRONG < told / lengths < WRONG)
+    )
     for other, name in ((repeated, "exact repetitions"), (lengths, "lengths on the body")):
         if told is None or other is None:
             continue
@@ -115,7 +127,7 @@ def _measurement(told: float | None, pure: _Scatter | None, lengths: float | Non
     if told is not None and not wrong:
         return told, "stated", notes
     if wrong:
-        notes.append("the stated uncertainty is ten times off and not believed")
+        notes.append("the stated uncertainty is far off and not believed")
     if repeated is not None and not (lengths is not None and lengths < repeated):
         return repeated, "repeats", notes
     return (lengths, "lengths", notes) if lengths is not None else (0.0, "none", notes)
@@ -136,7 +148,7 @@ def _within(residuals: Array, keys: NDArray[np.int64]) -> _Scatter | None:
     return _Scatter(float(np.sum((residuals - mean[labels]) ** 2)) / freedom * residuals.shape[1], freedom)
 
 
-def _stated(observations: Sequence[Observations]) -> float:
+def stated_square(observations: Sequence[Observations]) -> float:
     """Mean square (m2) of the error vector that the measurements state."""
     parts = []
     for o in observations:
@@ -147,7 +159,7 @@ def _stated(observations: Sequence[Observations]) -> float:
     return float(np.mean(np.concatenate(parts)))
 
 
-def _lengths(observations: Sequence[Observations]) -> float | None:
+def length_scatter(observations: Sequence[Observations]) -> float | None:
     """RMS error (m) of a point from how lengths between targets of a pose scatter over the poses; None without."""
     square, freedom = 0.0, 0
     for o in observations:

@@ -1,4 +1,7 @@
-"""Identification from measurements that state no uncertainty: variance components from the residuals."""
+"""Identification from measurements that state no uncertainty, or a wrong one: variance components.
+
+Each group's sum of squares is set against its share of the redundancy (Foerstner 1979).
+"""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -7,10 +10,18 @@ import numpy as np
 
 from robcal.calibration.identification import IdentifiedRobot, IdentifyOptions, identify
 from robcal.calibration.measurements import RobotObservations, RobotRecording, Rows, rescaled
-from robcal.calibration.observations import FrameObservations
+from robcal.calibration.noise_parts import length_scatter, stated_square
+from robcal.calibration.observations import FrameObservations, PointObservations
 from robcal.robot.kernel import Kernel, PoseInputs
 from robcal.robot.model import RobotModel
 from robcal.transforms import Array
+
+WRONG = 3.0
+"""Factor from which a stated sigma is not believed."""
+APART = 10.0
+"""Factor from which residuals of positions and rotations refute what is stated of them."""
+FEWEST = 50
+"""Redundancy from which residuals refute a stated sigma."""
 
 
 def identify_recording(
@@ -21,10 +32,15 @@ def identify_recording(
     options: IdentifyOptions,
     kernel: Kernel,
 ) -> tuple[IdentifiedRobot, RobotRecording]:
-    """Identify; where no uncertainty is stated, estimate variance components from the residuals and do so again."""
+    """Identify; again with variance components where no uncertainty is stated, or one that residuals contradict."""
     subset = inputs.subset(rows)
     found = identify(robot, subset, recording.select(rows), options, kernel)
-    for _ in range(0 if recording.stated else 2):
+    if recording.stated:
+        weighted = believable(found, subset, recording, rows)
+        if weighted is recording:
+            return found, recording
+        return identify(robot, subset, weighted.select(rows), options, kernel), weighted
+    for _ in range(2):
         factors = variance_factors(found, subset, recording.select(rows), recording.observations)
         observations = rescaled(recording.observations, factors)
         # points tell by their body how they scatter; what they carry, frames, follows the robot's residuals
@@ -33,6 +49,57 @@ def identify_recording(
         recording = replace(recording, observations=observations, detailed=detailed)
         found = identify(robot, subset, recording.select(rows), options, kernel)
     return found, recording
+
+
+def believable(found: IdentifiedRobot, inputs: PoseInputs, recording: RobotRecording, rows: Rows) -> RobotRecording:
+    """The recording itself, or with other weights where its stated sigmas are contradicted beyond what models miss.
+
+    Residuals hold the noise and what the model misses: they refute a stated sigma only from above, or where positions
+    and rotations disagree by far more than what is missed can. Lengths on the body refute it from below.
+    """
+    used = recording.select(rows)
+    residual = variance_factors(found, inputs, used, recording.observations)
+    seen = [any(type(o) is type(kind) for o in used) for kind in recording.observations]
+    lengths = _from_lengths(recording.select(rows, detailed=True))
+    factors = [
+        _refuted(factor, lengths) if known and found.redundancy >= FEWEST else np.ones(len(factor))
+        for factor, known in zip(residual, seen, strict=True)
+    ]
+    if all(np.all(factor == 1.0) for factor in factors):
+        return recording
+    observations = rescaled(recording.observations, factors)
+    points = [factor[:1] for factor in factors]
+    detailed = tuple(
+        new if own is old else rescaled([own], [factor])[0]
+        for own, old, new, factor in zip(recording.detailed, recording.observations, observations, points, strict=True)
+    )
+    told = " and ".join(f"{np.sqrt(f):.2g}" for f in dict.fromkeys(float(v) for factor in factors for v in factor))
+    note = f"the stated uncertainties are contradicted: the weights have {told} times the stated sigmas"
+    return replace(
+        recording,
+        observations=observations,
+        detailed=detailed,
+        weighted=float(np.sqrt(factors[0][0])),
+        notes=(*recording.notes, note),
+    )
+
+
+def _refuted(residual: Array, lengths: float | None) -> Array:
+    """Factors on the variances of one kind: ones where what is stated may be."""
+    if len(residual) > 1 and not APART**-2 < residual[0] / residual[1] < APART**2:
+        return residual
+    if np.all(residual < WRONG**-2):
+        return residual
+    if lengths is not None and lengths > WRONG**2:
+        return np.full(len(residual), lengths)
+    return np.ones(len(residual))
+
+
+def _from_lengths(observations: Sequence[RobotObservations]) -> float | None:
+    """Factor on the stated variance of points that lengths between them show; None where there are none."""
+    points = [o for o in observations if isinstance(o, PointObservations)]
+    scatter = length_scatter(points)
+    return None if scatter is None else scatter**2 / stated_square(points)
 
 
 def variance_factors(

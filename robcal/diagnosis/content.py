@@ -82,7 +82,9 @@ def _cause(finding: Finding) -> dict[str, object]:
         "explained": number(finding.explained),
         "poses": list(finding.poses),
         "heldout_mm": {"before": number(finding.heldout[0] * 1e3), "after": number(finding.heldout[1] * 1e3)},
-        "statement": finding.statement,
+        "in_force": not finding.waits,
+        "in_force_reason": finding.waits,
+        "statement": finding.told,
     }
 
 
@@ -226,6 +228,11 @@ def _listed(causes: object) -> list[object]:
 def summary(diagnosis: Diagnosis) -> str:
     """The one sentence for a person."""
     if not diagnosis.findings:
+        if diagnosis.unexplained_pattern is not None:
+            return (
+                f"The model misses something (p = {diagnosis.unexplained_p:.2g}, {diagnosis.unexplained_pattern}), for "
+                "which no cause of the library stands."
+            )
         text = "Nothing is missing: the model explains the recording down to its noise"
         if diagnosis.noise_estimated > 1.15 or diagnosis.noise_estimated < 0.85:
             text += f" (the data scatter {diagnosis.noise_estimated:.2f} times what their covariance says)"
@@ -237,9 +244,9 @@ def _with_gain(finding: Finding, count: int) -> str:
     """A statement with its share of the gain of all causes, or that poses kept out get no better by it."""
     before, after = finding.heldout
     if after >= before:
-        return f"{finding.statement}; poses kept out get no better by it"
+        return f"{finding.told}; poses kept out get no better by it"
     share = f"; it is {finding.explained:.0%} of what all causes gain" if count > 1 else ""
-    return f"{finding.statement}{share}"
+    return f"{finding.told}{share}"
 
 
 def number(value: object) -> object:

@@ -9,7 +9,7 @@ import numpy as np
 from robcal.diagnosis.core.fitting import Fit, fit
 from robcal.diagnosis.core.recording import Recording
 from robcal.diagnosis.core.result import Diagnosis, Finding
-from robcal.diagnosis.findings import at_last_fit, curve_findings, kept_out_error, named_findings, swap_findings
+from robcal.diagnosis.findings import at_fit, curve_findings, kept_out_error, named_findings, swap_findings
 from robcal.diagnosis.gain.heldout import noise_floor, region_errors
 from robcal.diagnosis.next_poses import separating_poses
 from robcal.diagnosis.noise.components import Noise, estimate_noise
@@ -71,7 +71,8 @@ def diagnose(
     final, whole, noise = _last_fit(case, curves, found)
     findings = (*of_curves, *_named(case, found))
     if whole is not found.chosen.recording:
-        findings = tuple(at_last_fit(finding, final) for finding in findings)
+        findings = tuple(at_fit(finding, final) for finding in findings)
+    findings = tuple(replace(finding, names=_names_in(final, finding)) for finding in findings)
     findings = (*exchanged, *findings)
     before = fit(case.model, found.chosen.recording, case.free)
     heldout = (
@@ -177,6 +178,12 @@ def _last_fit(case: _Case, curves: Curves, found: _Found) -> tuple[Fit, Recordin
     else:
         noise = estimate_noise(case.model, case.thin, case.free)
     return chosen.last.fit, chosen.recording, noise
+
+
+def _names_in(final: Fit, finding: Finding) -> tuple[str, ...]:
+    """Parameters of a fit's model that are the amplitudes of a finding; empty for displacements of the measurement."""
+    number = next(k for k, item in enumerate(final.accepted) if item.cause is finding.cause)
+    return () if isinstance(finding.cause, ObservationCause) else final.accepted[number].full_names(number)
 
 
 def _named(case: _Case, found: _Found) -> tuple[Finding, ...]:

@@ -15,9 +15,12 @@ from robcal.diagnosis.scan.posterior import rivals, signature
 from robcal.diagnosis.scan.statistics import orthonormal_basis
 from robcal.diagnosis.search.curves import Curves
 from robcal.diagnosis.search.selection import Selection, poses_that_carry
-from robcal.physics.cause import Array, ObservationData, numeric_sigma, prior_scale
+from robcal.physics.cause import Array, ObservationCause, ObservationData, numeric_sigma, prior_scale
 from robcal.physics.measuring import swapped
 from robcal.robot.model import RobotModel
+
+MOST_OF_IT = 0.5
+"""Share of a signature that a cause over time has to reproduce to be its alternative."""
 
 
 def recording_data(present: Fit, recording: Recording) -> ObservationData:
@@ -123,16 +126,23 @@ def named_findings(
     return tuple(findings)
 
 
-def at_last_fit(finding: Finding, final: Fit) -> Finding:
-    """A finding with the amplitudes, sigmas and sentence of the last fit, to all poses and beside all other causes.
+def at_fit(finding: Finding, final: Fit) -> Finding:
+    """A finding with the amplitudes, sigmas and sentence of another fit that has it in its model.
 
     Weakness: the uncertainty of constants that were refined in the search is left out.
     """
-    item = next((a for a in final.accepted if a.cause is finding.cause), None)
-    if item is None:
+    number = next((k for k, a in enumerate(final.accepted) if a.cause is finding.cause), None)
+    names = finding.names if number is None else final.accepted[number].full_names(number)
+    if number is not None and isinstance(finding.cause, ObservationCause):
+        item, names = final.accepted[number], ()
+    elif names and set(names) <= set(final.free):
+        at = [final.free.index(name) for name in names]
+        values = final.theta[[final.kernel.index[name] for name in names]]
+        item = Accepted(finding.cause, finding.constants, values, final.covariance[np.ix_(at, at)])
+    else:
         return finding
     factor = final.variance_factor
-    values, spread = rescaled(final, item, item.covariance * factor, factor)
+    values, spread = rescaled(final, item, names, item.covariance * factor, factor)
     reported, sigma = numeric_sigma(finding.cause.report, values, item.constants, spread)
     kept = {name: value for name, value in finding.parameters.items() if name not in reported}
     for name, (parameter, unit) in finding.cause.jointly_fitted.items():
@@ -150,7 +160,26 @@ def at_last_fit(finding: Finding, final: Fit) -> Finding:
         parameters=kept | reported,
         sigma={name: sigma.get(name, value) for name, value in finding.sigma.items()},
         statement=statement,
+        names=names,
     )
+
+
+def _with_confounded(
+    others: tuple[Rival, ...], chosen: Selection, analysis: Analysis, projected: Array
+) -> tuple[Rival, ...]:
+    """Rivals, and causes over time that the search could not tell from what else changed at their time and that
+    reproduce most of a projected signature (m,)."""
+    known = {(rival.cause.name, rival.cause.where) for rival in others}
+    size = max(float(projected @ projected), 1e-300)
+    found = list(others)
+    for item in chosen.confounded:
+        columns = analysis.at.columns(item.cause, item.constants)
+        basis = orthonormal_basis(columns - analysis.basis @ (analysis.basis.T @ columns))
+        share = float(np.sum((basis.T @ projected) ** 2)) / size
+        if share > MOST_OF_IT and (item.cause.name, item.cause.where) not in known:
+            # a time or a place: nothing in the recording decides between them
+            found.append(Rival(item.cause, item.constants, float("nan"), share))
+    return tuple(found)
 
 
 def _sum_of_squares(fitted: Fit) -> float:
@@ -185,11 +214,11 @@ def _covariance(last: Analysis, item: Accepted, held: Iterable[str]) -> Array:
     return cofactor[:count, :count]
 
 
-def rescaled(final: Fit, item: Accepted, covariance: Array, factor: float) -> tuple[Array, Array]:
+def rescaled(final: Fit, item: Accepted, names: Sequence[str], covariance: Array, factor: float) -> tuple[Array, Array]:
     """Amplitudes (k,) and their covariance (k, k) for the final value of the parameter through which they act.
 
     Only the product of both is in the law, so a parameter that the fit changed after the law was written changes the
-    amplitude; its uncertainty, and how it goes with the amplitudes', counts.
+    amplitude; its uncertainty, and how it goes with the amplitudes', counts. ``names`` of the amplitudes in the fit.
     """
     if item.cause.scaled_by is None or item.cause.scaled_by[0] not in final.free:
         return item.values, covariance
@@ -197,8 +226,7 @@ def rescaled(final: Fit, item: Accepted, covariance: Array, factor: float) -> tu
     value = final.model.parameters[name]
     ratio = written / value
     own = final.free.index(name)
-    number = next(k for k, other in enumerate(final.accepted) if other is item)
-    mixed = final.covariance[[final.free.index(full) for full in item.full_names(number)], own] * factor
+    mixed = final.covariance[[final.free.index(full) for full in names], own] * factor
     slope = -item.values * ratio / value
     cross = np.outer(ratio * mixed, slope)
     spread = ratio**2 * covariance + cross + cross.T + final.covariance[own, own] * factor * np.outer(slope, slope)
@@ -220,10 +248,13 @@ def _finding(
         if cause.kind.named:
             eligible = analysis.named & analysis.significant()
             others = rivals(analysis.causes, named, analysis.ranked, analysis.stacks, projected, eligible)
+    others = _with_confounded(others, chosen, analysis, projected)
     final = chosen.last.fit
     factor = final.variance_factor
     covariance = _covariance(chosen.last, item, chosen.tied) * factor
-    values, spread = rescaled(final, item, covariance, factor)
+    number = next(k for k, other in enumerate(final.accepted) if other is item)
+    names = () if isinstance(cause, ObservationCause) else item.full_names(number)
+    values, spread = rescaled(final, item, names, covariance, factor)
     reported, sigma = numeric_sigma(cause.report, values, item.constants, spread)
     for name, (parameter, unit) in cause.jointly_fitted.items():
         if parameter in final.free:

@@ -161,13 +161,13 @@ class RejectionLog:
     """Collects refused candidates; keeps at most `keep` places, counts all."""
 
     def __init__(self, keep: int = 2000) -> None:
-        self._keep = keep
+        self.keep = keep
         self._entries: list[tuple[float, float, float, Reason]] = []
         self._counts: dict[Reason, int] = {}
 
     def add(self, x: float, y: float, size: float, reason: Reason) -> None:
         self._counts[reason] = self._counts.get(reason, 0) + 1
-        if len(self._entries) < self._keep:
+        if len(self._entries) < self.keep:
             self._entries.append((float(x), float(y), float(size), reason))
 
     def add_rows(self, xy: Array, size: Array, reason: Reason) -> None:

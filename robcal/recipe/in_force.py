@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 from robcal.calibration.joint_log import JointLog
 from robcal.calibration.measurements import Rows
@@ -53,7 +54,9 @@ class InForce:
     diagnosed : whether it differs from the identified robot's.
     identified, diagnosed_error : errors (m) of the identified robot and of the one that is delivered, RMS over blocked
         folds of the identification poses, predicted from what the table of poses states.
-    reason : in words. dropped : parameters that were found and are not in force.
+    reason : in words.
+    waits : by parameter of the robot, why it was found and is not in force.
+    measuring : why faults of the measuring system that were found are not taken back.
     """
 
     form: Form
@@ -61,7 +64,44 @@ class InForce:
     identified: float
     diagnosed_error: float
     reason: str
-    dropped: tuple[str, ...] = field(default=())
+    waits: Mapping[str, str] = field(default_factory=dict)
+    measuring: str = ""
+
+
+@dataclass(frozen=True)
+class Folds:
+    """What robots deliver over blocked folds of the identification poses.
+
+    Attributes
+    ----------
+    recording : as it was measured. log : with approach directions as inferred. rows : of the recording in it.
+    """
+
+    recording: Recording
+    log: JointLog
+    rows: Rows
+
+    @cached_property
+    def labels(self) -> Array:
+        """Fold (n,) of each pose."""
+        return blocked_folds(self.recording)
+
+    @property
+    def of_rows(self) -> Array:
+        """Fold (m,) of each observation."""
+        return self.labels[self.recording.observations.pose]
+
+    def delivery(self, form: Form, given: JointLog, freed: bool = True) -> Delivery:
+        """A form fitted, and predicted from a table of poses; `freed` of faults of the measuring system."""
+        plain = replace(self.recording, common=None, shared=None)
+        fitted = form.fit(plain)
+        return Delivery(plain, fitted, given.inputs(fitted.kernel).subset(self.rows), self.labels, freed)
+
+    def gain(self, before: Form, after: Form, given: JointLog, freed: bool = True) -> tuple[Gain, Gain]:
+        """What one form gains against another: of plain lengths, and weighted by their uncertainty."""
+        errors = [self.delivery(form, given, freed).errors() for form in (before, after)]
+        plain, weighted = (gain_of(b, a, self.of_rows) for b, a in zip(*errors, strict=True))
+        return plain, weighted
 
 
 def choose(recording: Recording, log: JointLog, rows: Rows, bare: Form, extended: Form) -> InForce:
@@ -73,61 +113,65 @@ def choose(recording: Recording, log: JointLog, rows: Rows, bare: Form, extended
     depend on approach directions which nobody stated wait for them: they are in force if they pay with the directions
     inferred and cost nothing without.
     """
-    plain = replace(recording, common=None, shared=None)
-    labels = blocked_folds(recording)
-    fold = labels[recording.observations.pose]
-    stated = log.as_stated()
-
-    def delivery(form: Form, given: JointLog, freed: bool) -> Delivery:
-        fitted = form.fit(plain)
-        return Delivery(plain, fitted, given.inputs(fitted.kernel).subset(rows), labels, freed)
-
-    def gain(before: Form, after: Form, given: JointLog, freed: bool) -> tuple[Gain, Gain]:
-        errors = [delivery(form, given, freed).errors() for form in (before, after)]
-        plain_gain, weighted = (gain_of(b, a, fold) for b, a in zip(*errors, strict=True))
-        return plain_gain, weighted
-
-    chosen, reasons = bare, []
-    dropped: tuple[str, ...] = ()
-    if extended.direct:
-        beside = replace(bare, direct=extended.direct)
-        found, _ = gain(bare, beside, stated, True)
-        if any(_is_move(item) for item in extended.direct) and found.after > MOVED_SHARE * found.before:
-            reasons.append(
-                "moves of the station are not taken back, as they explain less than half: "
-                f"{1e3 * found.before:.3g} mm without, {1e3 * found.after:.3g} mm with them"
-            )
-            beside = replace(bare, direct=tuple(item for item in extended.direct if not _is_move(item)))
-            found, _ = gain(bare, beside, stated, True)
-        chosen = beside if beside.direct and found.clear else bare
-        if beside.direct:
-            reasons.append(_told("faults of the measuring", found, found.clear, found))
+    folds = Folds(recording, log, rows)
+    chosen, reasons, measuring = _beside_faults(folds, bare, extended.direct)
+    waits: dict[str, str] = {}
     if groups := groups_of(bare, extended):
-        full = replace(extended, direct=chosen.direct)
-        pays = False
-        for given in (stated, log) if log.inferred else (stated,):
-            dropped = not_paying(delivery(full, given, True), groups, fold)
-            part = full.without(dropped)
-            if len(dropped) == sum(map(len, groups.values())):
-                break
-            found, weighted = gain(chosen, part, stated, True)
-            pays = found.pays_beside(weighted)
-            reasons.append(_told("terms of the robot", found, pays, weighted))
-            if given is log and not pays and found.even and found.after <= WAITING * found.before:
-                known, weighted = gain(chosen, part, log, True)
-                pays = known.pays_beside(weighted)
-                words = "terms of the robot, where approach directions are stated"
-                reasons[-1] = _told(words, known, pays, weighted)
-            if pays:
-                break
-        chosen = part if pays else chosen
-        dropped = dropped if pays else tuple(name for names in groups.values() for name in names)
-        told = [name for name, names in groups.items() if set(names) <= set(dropped)]
-        if told and (pays or not reasons):
-            reasons.append(f"not in force, as they do not pay beside the others: {', '.join(told)}")
-    whole, _ = gain(bare, chosen, stated, False)
+        chosen, told, waits = _with_terms(folds, chosen, replace(extended, direct=chosen.direct), groups)
+        reasons += told
+    whole, _ = folds.gain(bare, chosen, log.as_stated(), freed=False)
     reason = "; ".join(reasons) + ("" if chosen is not bare else "; the identified robot is delivered")
-    return InForce(chosen, chosen is not bare, whole.before, whole.after, reason, dropped)
+    return InForce(chosen, chosen is not bare, whole.before, whole.after, reason, waits, measuring)
+
+
+def _beside_faults(folds: Folds, bare: Form, direct: Sequence[Accepted]) -> tuple[Form, list[str], str]:
+    """The form beside faults of the measuring system that are beyond doubt, reasons, and why others are left."""
+    if not direct:
+        return bare, [], ""
+    reasons, stated = [], folds.log.as_stated()
+    beside = replace(bare, direct=direct)
+    found, _ = folds.gain(bare, beside, stated)
+    if any(_is_move(item) for item in direct) and found.after > MOVED_SHARE * found.before:
+        reasons.append(
+            "moves of the station are not taken back, as they explain less than half: "
+            f"{1e3 * found.before:.3g} mm without, {1e3 * found.after:.3g} mm with them"
+        )
+        beside = replace(bare, direct=tuple(item for item in direct if not _is_move(item)))
+        found, _ = folds.gain(bare, beside, stated)
+    why = list(reasons)
+    if beside.direct:
+        reasons.append(_told("faults of the measuring", found, found.clear, found))
+        why += [] if found.clear else reasons[-1:]
+    return beside if beside.direct and found.clear else bare, reasons, "; ".join(why)
+
+
+def _with_terms(folds: Folds, base: Form, full: Form, groups: Groups) -> tuple[Form, list[str], dict[str, str]]:
+    """The form with the terms that pay, reasons, and by parameter why the others wait."""
+    stated = folds.log.as_stated()
+    unpaid = not_paying(folds.delivery(full, stated), groups, folds.of_rows)
+    part, reasons = base, []
+    if len(unpaid) < len(groups):
+        trial = full.without([name for group in unpaid for name in groups[group]])
+        found, weighted = folds.gain(base, trial, stated)
+        pays = found.pays_beside(weighted)
+        reasons.append(_told("terms of the robot", found, pays, weighted))
+        part, unpaid = (trial, unpaid) if pays else (base, dict.fromkeys(groups, found))
+    if unpaid and folds.log.inferred:
+        known = not_paying(folds.delivery(full, folds.log), groups, folds.of_rows)
+        waiting = [group for group in unpaid if group not in known]
+        trial = full.without([name for group in unpaid if group in known for name in groups[group]])
+        if waiting:
+            found, weighted = folds.gain(part, trial, folds.log)
+            cost, _ = folds.gain(part, trial, stated)
+            pays = found.pays_beside(weighted) and cost.even and cost.after <= WAITING * cost.before
+            words = f"terms of the robot, where approach directions are stated ({', '.join(waiting)}),"
+            reasons.append(_told(words, found, pays, weighted))
+            part = trial if pays else part
+            unpaid = {group: gain for group, gain in unpaid.items() if not pays or group in known}
+    if unpaid:
+        reasons.append(f"not in force, as they do not pay beside the others: {', '.join(unpaid)}")
+    why = {group: f"error over blocked folds {_errors(gain, 'it')}" for group, gain in unpaid.items()}
+    return part, reasons, {name: why[group] for group in unpaid for name in groups[group]}
 
 
 def _is_move(item: Accepted) -> bool:
@@ -147,28 +191,42 @@ def groups_of(bare: Form, extended: Form) -> Groups:
     return groups | {name: (name,) for name in extended.free if name not in present | of_terms}
 
 
-def not_paying(full: Delivery, groups: Groups, fold: Array) -> tuple[str, ...]:
-    """Parameters of the groups that do not pay beside those that stay: backward, the most useless one first."""
+def not_paying(full: Delivery, groups: Groups, fold: Array) -> dict[str, Gain]:
+    """Groups that do not pay beside those that stay, and the gain of each: backward, the most useless one first."""
+    return _backward(full, groups, fold, lambda plain, weighted: plain.pays_beside(weighted))
+
+
+def contradicted(full: Delivery, groups: Groups, fold: Array) -> dict[str, Gain]:
+    """Groups without which blocked folds are predicted no worse, and the weighted gain of each: backward."""
+    return _backward(full, groups, fold, lambda plain, weighted: weighted.after < weighted.before)
+
+
+def _backward(full: Delivery, groups: Groups, fold: Array, stays: Callable[[Gain, Gain], bool]) -> dict[str, Gain]:
     left = dict(groups)
+    out: dict[str, Gain] = {}
     dropped: tuple[str, ...] = ()
     errors = full.errors()
     while left:
-        trials: dict[str, tuple[float, bool, tuple[str, ...], tuple[Array, Array]]] = {}
+        trials: dict[str, tuple[Gain, tuple[Array, Array]]] = {}
         for name, names in left.items():
             without = full.errors((*dropped, *names))
-            found, weighted = (gain_of(b, a, fold) for b, a in zip(without, errors, strict=True))
-            trials[name] = (-found.strength, found.pays_beside(weighted), (*dropped, *names), without)
-        useless = {name: trial for name, trial in trials.items() if not trial[1]}
-        if not useless:
+            plain, weighted = (gain_of(b, a, fold) for b, a in zip(without, errors, strict=True))
+            if not stays(plain, weighted):
+                trials[name] = plain, without
+        if not trials:
             break
-        worst = max(useless, key=lambda name: useless[name][0])
-        _, _, dropped, errors = useless[worst]
-        del left[worst]
-    return dropped
+        worst = min(trials, key=lambda name: trials[name][0].strength)
+        out[worst], errors = trials[worst]
+        dropped = (*dropped, *left.pop(worst))
+    return out
+
+
+def _errors(found: Gain, what: str) -> str:
+    return f"{1e3 * found.before:.3g} mm without, {1e3 * found.after:.3g} mm with {what}"
 
 
 def _told(what: str, found: Gain, accepted: bool, weighted: Gain) -> str:
-    errors = f"{1e3 * found.before:.3g} mm without, {1e3 * found.after:.3g} mm with them"
+    errors = _errors(found, "them")
     if accepted and not found.pays:
         return (
             f"{what} pay: error over blocked folds, weighted by its uncertainty, {weighted.before:.4g} without, "

@@ -23,4 +23,12 @@ def noise_of(identification: Identification, robot: CalibratedRobot, log: JointL
     residuals = np.concatenate([o.evaluate(T)[0][:, :3] for o in observations])
     J = robot.kernel.joint_jacobian(robot.kernel.theta0, inputs)[:, :3]
     lever = float(np.sqrt(np.mean(np.sum(J**2, axis=(1, 2)))))
-    return noise_parts(log.q[rows], residuals, len(robot.names), observations, stated=recording.stated, lever=lever)
+    return noise_parts(
+        log.q[rows],
+        residuals,
+        len(robot.names),
+        observations,
+        stated=recording.stated,
+        lever=lever,
+        weighted=recording.weighted,
+    )

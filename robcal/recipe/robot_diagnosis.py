@@ -16,7 +16,7 @@ from robcal.calibration.identification import IdentifiedRobot
 from robcal.calibration.joint_log import JointLog
 from robcal.calibration.measurements import RobotObservations, RobotRecording, Rows, evenly_weighted
 from robcal.calibration.observations import DistanceObservations, FrameObservations, PointObservations
-from robcal.diagnosis.core.fitting import Accepted, fit
+from robcal.diagnosis.core.fitting import Accepted, Fit, fit
 from robcal.diagnosis.core.recording import Recording, observation_data
 from robcal.diagnosis.core.result import Diagnosis
 from robcal.diagnosis.diagnose import diagnose
@@ -28,6 +28,7 @@ from robcal.photogrammetry.core.bodies import Body
 from robcal.photogrammetry.measure.measured_points import MeasuredPoints
 from robcal.photogrammetry.station.network import StationOrientation
 from robcal.physics.cause import DEVIATION, ObservationCause
+from robcal.recipe.confirmation import confirmed, with_force
 from robcal.recipe.evidence import Evidence, evidence_of
 from robcal.recipe.identification import Identification
 from robcal.recipe.image_findings import ImageFindings
@@ -158,13 +159,16 @@ def diagnose_robot(
     kept = ~np.isin(np.array(clean.names), diagnosis.blunders)
     clean, rows = clean.subset(kept), found.rows[kept]
     bare, extended = Form(robot.model, free), Form(diagnosis.model, diagnosis.free, _displacements(diagnosis))
+    if diagnosis.findings:
+        diagnosis, extended = confirmed(diagnosis, clean, log, rows, extended)
     in_force = InForce(bare, False, float("nan"), float("nan"), "nothing was found")
     if diagnosis.findings:
         in_force = choose(clean, log, rows, bare, extended)
     if not in_force.diagnosed:
         used = robot.used[kept]  # poses that the identification left out
         clean, rows = clean.subset(used), rows[used]
-    delivered, relative, put = robot_in_force(found, log, clean, rows, in_force.form)
+    delivered, relative, put, final = robot_in_force(found, log, clean, rows, in_force.form)
+    diagnosis = replace(diagnosis, findings=with_force(diagnosis.findings, in_force, final))
     if not in_force.diagnosed and not recording.own_station:
         delivered = found.robot  # as it was identified, so that nothing is worse than without a diagnosis
     delivered = with_lack_of_fit(delivered, found, log, clean, rows, in_force.form)
@@ -182,7 +186,7 @@ def diagnose_robot(
 
 def robot_in_force(
     found: Identification, log: JointLog, recording: Recording, rows: Rows, form: Form
-) -> tuple[CalibratedRobot, Array | None, RobotRecording | None]:
+) -> tuple[CalibratedRobot, Array | None, RobotRecording | None, Fit]:
     """All parameters and terms of a model once more together, with base and tool in the datum of the measurements.
 
     A robot that is fitted beside the errors of its own station is better than one from its frames alone; what those
@@ -196,7 +200,7 @@ def robot_in_force(
     Returns
     -------
     The robot; (p, p) the covariance of its parameters where errors common to all poses are known, None where there are
-    none; the measurements without what follows the order of the poses, None where nothing does.
+    none; the measurements without what follows the order of the poses, None where nothing does; the fit itself.
     """
     noise = estimate_noise(form.model, recording, form.free, form.direct)
     final = form.fit(noise.apply(recording))
@@ -227,7 +231,7 @@ def robot_in_force(
         robot = replace(robot, model=with_fitted_cell(robot.kernel, stated, measured, joint))
     nominal = found.robot.nominal
     robot = robot if nominal is None else robot.with_recording(log, nominal)
-    return robot, relative, put
+    return robot, relative, put, final
 
 
 def with_lack_of_fit(

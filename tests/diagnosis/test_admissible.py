@@ -45,9 +45,10 @@ def test_a_jump_when_another_joint_sets_out_is_not_to_be_told() -> None:
     present, at = at_poses(blocks(40, 20))
     jump = Accepted(cause(at, "zero_jump", "axis3"), {"pose": 20.0}, np.array([1e-3]), np.eye(1))
     assert confounded_with(jump, at) == "axis1"
-    text = refusal(jump, present, present, at)
-    assert text is not None
-    assert "cannot be told" in text
+    refused = refusal(jump, present, present, at)
+    assert refused is not None
+    assert refused.confounded
+    assert "cannot be told" in refused.reason
     assert confounded_with(replace(jump, constants={"pose": 8.0}), at) == ""
 
 

@@ -115,7 +115,7 @@ def test_torque_that_acts_through_a_compliance_is_told_for_the_compliance_of_the
     covariance = np.diag([(0.1 * end) ** 2, 0.0, 0.0])
     model = SimpleNamespace(parameters={"axis2.elastic_pitch": end})
     final = SimpleNamespace(free=names, accepted=(item,), covariance=covariance, model=model)
-    values, spread = rescaled(final, item, np.eye(2), 1.0)  # type: ignore[arg-type]
+    values, spread = rescaled(final, item, item.full_names(0), np.eye(2), 1.0)  # type: ignore[arg-type]
     # the same deflection through half the compliance takes twice the torque; a tenth of it is as uncertain
     assert np.allclose(values, 2.0 * torque)
     assert np.allclose(spread, 4.0 * np.eye(2) + 0.01 * np.outer(values, values))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from robcal.recipe.in_force import Form, groups_of
+from robcal.recipe.in_force import Form, contradicted, groups_of
 from robcal.recipe.lack_of_fit import _balanced
 from robcal.recipe.order import covariance_without_order, without_order
 from robcal.robot.model import Frame, RobotModel, Term
@@ -49,3 +49,22 @@ def test_scatter_of_the_joints_makes_up_the_excess_of_variance() -> None:
     assert np.sum(square @ found**2) == pytest.approx(excess.sum())
     assert found[0] < found[1]
     assert not np.any(_balanced(-excess, square))
+
+
+class Predicted:
+    """Errors of forty poses: `useful` halves them, of `twin` and `other` either one does, `idle` none."""
+
+    def errors(self, dropped: tuple[str, ...] = ()) -> tuple[np.ndarray, np.ndarray]:
+        size = np.random.default_rng(1).uniform(0.5, 1.5, 40)
+        size = size * (2.0 if "useful" in dropped else 1.0) * (0.99 if "idle" in dropped else 1.0)
+        size = size * {0: 1.001, 1: 1.0, 2: 1.8}[len({"twin", "other"} & set(dropped))]
+        return size, size
+
+
+def test_causes_without_which_folds_are_predicted_no_worse_are_contradicted() -> None:
+    groups = {name: (name,) for name in ("useful", "twin", "other", "idle")}
+    fold = np.repeat(np.arange(8), 5)
+    weak = contradicted(Predicted(), groups, fold)  # type: ignore[arg-type]
+    assert "idle" in weak
+    assert "useful" not in weak
+    assert len({"twin", "other"} & set(weak)) == 1

@@ -13,7 +13,8 @@ class Rival:
 
     Attributes
     ----------
-    probability : posterior probability within the library, all causes of equal prior weight.
+    probability : posterior probability within the library, all causes of equal prior weight; NaN where the
+        recording cannot decide.
     overlap : share of the named cause's projected signature that the rival can reproduce, 0 to 1.
     """
 
@@ -37,6 +38,8 @@ class Finding:
     explained : its share, 0 to 1, of the drop of the whitened sum of squares by all causes, added in their order.
     poses : names of the poses that carry most of it.
     heldout : position error on kept-out poses in metres, before and after adding it.
+    names : parameters of the diagnosed model that are its amplitudes; empty for displacements of the measurement.
+    waits : why it is not in force in the robot that is delivered; empty where it is, or where nobody has decided.
     """
 
     cause: LinearCause
@@ -52,6 +55,13 @@ class Finding:
     rivals: tuple[Rival, ...] = ()
     explained: float = 1.0
     poses: tuple[str, ...] = ()
+    names: tuple[str, ...] = ()
+    waits: str = ""
+
+    @property
+    def told(self) -> str:
+        """The statement, and that it is not in force where that is so."""
+        return f"{self.statement} (not in force in the delivered robot)" if self.waits else self.statement
 
 
 @dataclass(frozen=True)

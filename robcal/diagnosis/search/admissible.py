@@ -5,6 +5,7 @@ else changes from pose to pose; and it must gain on poses kept out in blocks.
 """
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -24,7 +25,15 @@ SURE = 2.0
 """Change of a fold's sum of squares, in units of the variance factor, that counts for or against a cause."""
 
 
-def refusal(item: Accepted, before: Fit, after: Fit, at: Tangents) -> str | None:
+@dataclass(frozen=True)
+class Refusal:
+    """Why a cause that fits is not accepted; `confounded` if what else changed at its time explains it as well."""
+
+    reason: str
+    confounded: bool = False
+
+
+def refusal(item: Accepted, before: Fit, after: Fit, at: Tangents) -> Refusal | None:
     """Why a cause is not accepted although it fits; None if it may be.
 
     Parameters
@@ -33,19 +42,22 @@ def refusal(item: Accepted, before: Fit, after: Fit, at: Tangents) -> str | None
     """
     cause = item.cause
     if not possible(item, after):
-        return f"{cause.describe(cause.report(item.values, item.constants))}, which cannot be"
+        return Refusal(f"{cause.describe(cause.report(item.values, item.constants))}, which cannot be")
     if cause.of_order:
         if not cause.kind.named:
-            return f"something at {cause.where} follows the order or the time of the poses, which is no law of a robot"
+            return Refusal(
+                f"something at {cause.where} follows the order or the time of the poses, which is no law of a robot"
+            )
         together = confounded_with(item, at)
         if together:
-            return (
+            return Refusal(
                 f"{cause.kind.words} at {cause.where} cannot be told from what follows {together}, which changes at "
-                "the same time: repeat some of the first poses at the end"
+                "the same time: repeat some of the first poses at the end",
+                confounded=True,
             )
         return None
     if not gains(before, after, at.recording):
-        return f"{cause.kind.words} at {cause.where} does not gain on blocks of poses that are kept out"
+        return Refusal(f"{cause.kind.words} at {cause.where} does not gain on blocks of poses that are kept out")
     return None
 
 

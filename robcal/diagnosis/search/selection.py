@@ -71,6 +71,7 @@ class Selection:
     blunders : observations left out: (index in the recording given, its pose's row).
     without : with several causes, analyses at the fits without one of them each, in their order.
     refused : why causes that fit were not accepted.
+    confounded : those of them that cannot be told from what else changed at their time, as they were fitted.
     """
 
     recording: Recording
@@ -83,6 +84,7 @@ class Selection:
     blunders: tuple[tuple[int, int], ...]
     without: tuple[Analysis, ...] = ()
     refused: tuple[str, ...] = ()
+    confounded: tuple[Accepted, ...] = ()
 
 
 DEFAULTS = SelectionSettings()
@@ -105,6 +107,7 @@ def select(
     most_blunders = int(settings.blunder_share * len(number))
     first: Analysis | None = None
     barred: dict[Key, str] = {}
+    confounded: list[Accepted] = []
     without: tuple[Analysis, ...] = ()
     settled, weighed = False, True
     present = fit(model, recording, free)
@@ -134,7 +137,7 @@ def select(
             continue
         trial = None
         if analysis.p_value <= _level(analysis, accepted, settings) and _unexpected(accepted) < settings.most:
-            trial = _extended(model, recording, free, analysis, barred, settings, tell)
+            trial = _extended(model, recording, free, analysis, (barred, confounded), settings, tell)
         if trial is not None:
             accepted = trial.accepted
             recording, present = _weighed(model, recording, free, trial)
@@ -158,7 +161,17 @@ def select(
         present = fit(model, recording, free, accepted)
     refused = tuple(reason for reason in barred.values() if reason)
     return Selection(
-        recording, present.accepted, tuple(p_values), first, analysis, free, tied, tuple(left_out), without, refused
+        recording,
+        present.accepted,
+        tuple(p_values),
+        first,
+        analysis,
+        free,
+        tied,
+        tuple(left_out),
+        without,
+        refused,
+        tuple(confounded),
     )
 
 
@@ -188,12 +201,13 @@ def _extended(
     recording: Recording,
     free: tuple[str, ...],
     analysis: Analysis,
-    barred: dict[Key, str],
+    refused: tuple[dict[Key, str], list[Accepted]],
     settings: SelectionSettings,
     tell: Callable[[str], None],
 ) -> Fit | None:
     """The fit with the best cause added; causes whose refit does not keep the linear promise, or that are refused, are
-    barred, with the reason."""
+    barred, with the reason (first of ``refused``; second those that are confounded)."""
+    barred, confounded = refused
     for _ in range(settings.most_futile):
         open_to = np.array([cause.key not in barred for cause in analysis.causes])
         choice = choose(analysis, open_to, settings.level)
@@ -208,7 +222,8 @@ def _extended(
             if reason is None:
                 tell(f"{added.cause.name} at {added.cause.where}: p {analysis.p_value:.2g}")
                 return trial
-            barred[added.cause.key] = reason
+            barred[added.cause.key] = reason.reason
+            confounded += [trial.accepted[-1]] if reason.confounded else []
         else:
             barred[added.cause.key] = ""
     return None
@@ -228,13 +243,14 @@ def newly_visible(analysis: Analysis, tied: frozenset[str]) -> tuple[str, ...]:
     """
     seen: list[str] = []
     basis = analysis.basis
+    sigma = float(np.sqrt(analysis.fit.variance_factor))  # of the whitened observations, whatever they state
     for name in sorted(tied):
         column = analysis.at.parameters.get(name)
         if column is None:
             continue
         column = column * prior_scale(name, analysis.at.variables)
         rest = column - basis @ (basis.T @ column)
-        if np.linalg.norm(rest) > VISIBLE_SIGMA:
+        if np.linalg.norm(rest) > VISIBLE_SIGMA * sigma:
             seen.append(name)
             basis = np.column_stack([basis, rest / np.linalg.norm(rest)])
     return tuple(seen)
