@@ -293,6 +293,6 @@ def _fits(state: _State, windows: CornerWindows, correlation: float) -> CornerFi
         amplitude=state.parameters[:, 8],
         chi2=chi2,
         misfit=np.sqrt(np.maximum(square - expected, 0.0)) / np.maximum(contrast, 1e-6),
-        saturated=(windows.saturated & windows.valid).any(axis=1),
+        saturated=np.asarray((windows.saturated & windows.valid).any(axis=1)),
         converged=good,
     )

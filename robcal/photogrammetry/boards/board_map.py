@@ -64,7 +64,9 @@ def fit_map(board_xy: Array, image_xy: Array) -> BoardMap | None:
     p = (board_xy - centre) / scale
     terms = 10 if len(p) >= _CUBIC_FROM else 6 if len(p) >= _SQUARE_FROM else 0
     weight = np.ones(len(p))
-    homography, bend, sigma = np.eye(3), np.zeros((terms, 2)), 0.0
+    homography: Array = np.eye(3)
+    bend: Array = np.zeros((terms, 2))
+    sigma = 0.0
     for _ in range(_ROUNDS):
         good = weight > 0.05
         if good.sum() < max(4, terms + 2):
@@ -76,7 +78,10 @@ def fit_map(board_xy: Array, image_xy: Array) -> BoardMap | None:
         flat = BoardMap(centre, scale, homography, np.zeros((0, 2)), 0.0)(board_xy)
         if terms:
             design = _monomials(p, terms)
-            bend = np.linalg.lstsq(design * weight[:, None], (image_xy - flat) * weight[:, None], rcond=None)[0]
+            bend = np.asarray(
+                np.linalg.lstsq(design * weight[:, None], (image_xy - flat) * weight[:, None], rcond=None)[0],
+                dtype=float,
+            )
         away = np.linalg.norm(image_xy - flat - _monomials(p, terms) @ bend, axis=1)
         # median of a Rayleigh distribution
         sigma = max(float(np.median(away)) / 1.1774, 1e-3)
