@@ -187,6 +187,9 @@ def _circles(image: NDArray, board: Board, polarity: Polarity) -> Detections:
     return Detections(dots.shape, noise=dots.noise, rejected=dots.rejected, message="", **columns)
 
 
+_find_grid: Any = cv2.findCirclesGrid  # the stubs do not know that without a blob detector it takes points
+
+
 def _grid_of_dots(dots: Detections, board: Board) -> NDArray[np.int64] | None:
     """(t,) row of the dot of each circle, None where they form no such grid."""
     if len(dots) < board.columns * board.rows:
@@ -199,7 +202,7 @@ def _grid_of_dots(dots: Detections, board: Board) -> NDArray[np.int64] | None:
             continue
         points = dots.xy[chosen].astype(np.float32).reshape(-1, 1, 2)
         for flags in (basic, basic | cv2.CALIB_CB_CLUSTERING):
-            found, centres = cv2.findCirclesGrid(
+            found, centres = _find_grid(
                 points, (board.columns, board.rows), flags, None, cv2.CirclesGridFinderParameters()
             )
             if not found:

@@ -60,21 +60,23 @@ def read_markers(grey: NDArray[np.uint8], board: Board, border_bits: int) -> Mar
         corners, ids, _ = detector.detectMarkers(picture)
         if ids is None:
             continue
-        numbers = np.asarray(ids).ravel()
-        for number, place in zip(numbers.tolist(), corners, strict=True):
-            if 0 <= number < board.markers and np.count_nonzero(numbers == number) == 1:
+        read = [int(number) for number in np.asarray(ids).ravel()]
+        for number, place in zip(read, corners, strict=True):
+            if 0 <= number < board.markers and read.count(number) == 1:
                 found.setdefault(number, np.asarray(place, dtype=float).reshape(4, 2))
     best = MarkerReading.none()
     if len(found) < 2:
         return best
     numbers = np.array(sorted(found), dtype=np.int64)
-    image = np.array([found[number] for number in numbers.tolist()])
+    image = np.array([found[number] for number in sorted(found)])
     for legacy in (False, True) if board.kind == "charuco" and board.rows % 2 == 0 else (False,):
         for turns in range(4) if board.kind == "aprilgrid" else (0,):
             sheet = np.roll(board.marker_corners(legacy=legacy)[numbers], turns, axis=1)
             keep = _agreeing(sheet, image)
             if keep.sum() > len(best.ids):
-                best = MarkerReading(numbers[keep], image[keep], sheet[keep], border_bits, legacy)
+                best = MarkerReading(
+                    np.asarray(numbers[keep], dtype=np.int64), image[keep], sheet[keep], border_bits, legacy
+                )
     return best if len(best.ids) >= 2 else MarkerReading.none()
 
 
@@ -133,14 +135,15 @@ def corners_from_markers(board: Board, reading: MarkerReading) -> tuple[NDArray[
     side = np.linalg.norm(np.roll(reading.corners, -1, axis=1) - reading.corners, axis=2).mean(axis=1)
     middle = reading.board_corners.mean(axis=1)
     beside = np.abs(points[:, None] - middle[None]).max(axis=2) < 0.51 * (board.square or 0.0)
-    ids, places = [], []
+    corners: list[int] = []
+    places: list[Array] = []
     for number in np.flatnonzero(beside.any(axis=1)).tolist():
         rows = np.flatnonzero(beside[number])
         seen = np.array([_through(maps[row], points[number][None])[0] for row in rows])
         if np.ptp(seen, axis=0).max() <= _DISAGREE * side[rows].max():
-            ids.append(number)
+            corners.append(number)
             places.append(seen.mean(axis=0))
-    return np.array(ids, dtype=np.int64), np.array(places, dtype=float).reshape(-1, 2)
+    return np.array(corners, dtype=np.int64), np.array(places, dtype=float).reshape(-1, 2)
 
 
 def _order_on_sheet(board_corners: Array) -> NDArray[np.int64]:

@@ -33,7 +33,7 @@ def oriented(board: Board, xy: Array, grey: NDArray[np.uint8] | None) -> tuple[A
         places = turned.reshape(-1, 2)
         homography, _ = cv2.findHomography(points, places, 0)
         # seen from the front: x to y turns clockwise, which in the image (y down) is a positive determinant
-        if homography is None or _determinant(homography, points.mean(axis=0)) <= 0:
+        if homography is None or _determinant(np.asarray(homography, dtype=float), points.mean(axis=0)) <= 0:
             continue
         flat = cv2.perspectiveTransform(points[None].astype(np.float64), homography)[0]
         if np.sqrt(np.mean((flat - places) ** 2)) > _FIT * pitch:
