@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Generic, TypeVar
 if TYPE_CHECKING:  # a stage depends on the types that it uses, not on those of all others
     from collections.abc import Mapping, Sequence
 
-    from pipeline.stages.detect import DetectionIndex
+    from pipeline.detected_images import DetectionIndex
     from robcal.calibration.calibrated import CalibratedRobot
     from robcal.calibration.instruments import IdentifiedInstruments
     from robcal.calibration.measurements import RobotRecording, Rows

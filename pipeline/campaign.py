@@ -8,7 +8,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from pipeline.campaign_schema import FORMAT, CampaignEntry, InstrumentEntry, StationCameraEntry, SurveyEntry
+from pipeline.campaign_schema import FORMAT, CampaignEntry, InstrumentEntry, StationCameraEntry, SurveyEntry, TableUse
 from pipeline.correction import module_file
 from pipeline.instrument_frames import cell_frames
 from robcal.calibration.instruments import CellFrame
@@ -16,7 +16,9 @@ from robcal.errors import InvalidInput, RobcalError
 from robcal.files.body_file import BodyFile, check_ring_codes, read_body
 from robcal.files.camera_file import CameraFile, read_camera
 from robcal.files.camera_import import split_choice
+from robcal.files.foreign_tables import read_mapped_table
 from robcal.files.images import list_images
+from robcal.files.joint_logs import is_joint_log, log_of_robot, read_controller_log
 from robcal.files.measurement_tables import (
     MarksTable,
     MeasuredTable,
@@ -201,10 +203,11 @@ class _Reader:
             self.faults.extend(error.faults if isinstance(error, InvalidInput) else [str(error)])
         return None
 
-    def _rows(self, name: str, read: Callable[[Table], T]) -> T:
+    def _rows(self, use: TableUse, read: Callable[[Table], T]) -> T:
         """What a table says; where faults are noted, what its sound rows say."""
+        path, foreign = self._file(use.file), use.table_map()
         try:
-            table = read_table(self._file(name))
+            table = read_table(path) if foreign is None else read_mapped_table(path, foreign)
         except FaultyRows as error:
             if self.faults is None:
                 raise
@@ -219,13 +222,18 @@ class _Reader:
                 self.faults.extend(error.faults)
                 table = error.rest
 
-    def _poses(self, name: str, robot: RobotModel | None) -> Poses:
+    def _poses(self, use: TableUse, robot: RobotModel | None) -> Poses:
+        if use.table_map() is None and is_joint_log(self._place(use.file)):
+            table = log_of_robot(read_controller_log(self._file(use.file)), robot)
+            self.pose_names = table.columns["pose"]
+            return poses_of(table, robot, robot.payloads if robot else ())
+
         def read(table: Table) -> Poses:
             if not self.pose_names and table.has("pose"):
                 self.pose_names = table.columns["pose"]
             return poses_of(table, robot, robot.payloads if robot else ())
 
-        return self._rows(name, read)
+        return self._rows(use, read)
 
     def read(self) -> Campaign:
         entry = self.entry
@@ -264,7 +272,7 @@ class _Reader:
         )
 
     def _tables(
-        self, names: Sequence[str], robot: RobotModel | None, poses: Poses | None, bodies: Mapping[str, BodySource]
+        self, uses: Sequence[TableUse], robot: RobotModel | None, poses: Poses | None, bodies: Mapping[str, BodySource]
     ) -> tuple[MeasuredTable, ...]:
         known = poses.names if poses is not None else ()
         sound = self.faults is None or known == self.pose_names
@@ -278,7 +286,7 @@ class _Reader:
             self._check_targets(table, found, bodies)
             return found
 
-        found = [self._part(partial(self._rows, name, read)) for name in names]
+        found = [self._part(partial(self._rows, use, read)) for use in uses]
         tables = tuple(table for table in found if table is not None)
         for table in tables:
             self.warnings.extend(table.notes)
@@ -422,7 +430,7 @@ class _Reader:
         if start is not None:
             size = (start.camera.width, start.camera.height)
         if entry.observations is not None:
-            marks = self._rows(entry.observations, marks_of)
+            marks = self._rows(TableUse(file=entry.observations), marks_of)
             check_marks(marks, size)
             return ImageSource({}, marks, start, start_path, size)
         folder = self._place(str(entry.images)).absolute()  # the report looks for them from anywhere

@@ -14,6 +14,7 @@ from pipeline.command_line import CampaignPath, InstrumentName, Json, Quiet, Run
 from pipeline.drift_commands import app as drift_app
 from pipeline.mastering_commands import mastering
 from pipeline.messages import LOG
+from pipeline.program_commands import programs
 
 app = typer.Typer(
     name="pipeline",
@@ -26,6 +27,7 @@ app = typer.Typer(
 app.add_typer(cell, name="cell")
 app.add_typer(drift_app, name="drift")
 app.add_typer(mastering)
+app.add_typer(programs)
 
 RunOrDrift = Annotated[
     Path, typer.Argument(metavar="RUN", help="Run folder of a finished campaign, or state of a drift control.")

@@ -11,13 +11,12 @@ from pipeline.instrument_results import instrument_notes, instruments_result
 from pipeline.runs import Run
 from pipeline.stages.base import Context, Outcome, Stage
 from pipeline.stages.observations import build_instruments, build_recording, corrections_of
-from pipeline.stages.survey import located
 from robcal.calibration.calibrated import CalibratedRobot
 from robcal.calibration.identification import IdentifiedRobot, IdentifyOptions
 from robcal.calibration.measurements import RobotRecording, Rows
 from robcal.calibration.recording_errors import mirror_residuals
 from robcal.calibration.recording_errors.search import fault_of
-from robcal.errors import InvalidInput, RobcalError
+from robcal.errors import InvalidInput, RobcalError, located
 from robcal.files.poses_table import Poses
 from robcal.files.robot_file import write_robot
 from robcal.files.schemas import proposal
