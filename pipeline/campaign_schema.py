@@ -100,6 +100,26 @@ class StationEntry(Entry):
     body: Text
 
 
+class HandEyeCameraEntry(StationCameraEntry):
+    """The camera of a hand-eye calibration: an image per pose; ``hold`` keeps its calibration as it is."""
+
+    name: Text = "camera"
+    hold: bool = False
+
+
+class HandEyeEntry(Entry):
+    """A camera in the hand of the robot, or beside it, and the board that it sees.
+
+    ``flange`` is a table of flange frames in base coordinates, in place of a robot and its joint angles.
+    """
+
+    camera: HandEyeCameraEntry
+    mounted: Literal["hand", "world"] = "hand"
+    board: Text
+    flange: Text | None = None
+    board_scale_ppm: Positive | None = None
+
+
 class QualityEntry(Entry):
     """Limits."""
 
@@ -204,6 +224,7 @@ class CampaignEntry(Entry):
     payloads: dict[str, PayloadEntry] = Field(default_factory=dict)
     bodies: dict[str, BodyUse] = Field(default_factory=dict)
     station: StationEntry | None = None
+    hand_eye: HandEyeEntry | None = None
     quality: QualityEntry = QualityEntry()
     measurements: Tables = Field(default_factory=list)
     body: Text | None = None

@@ -251,18 +251,29 @@ def export(
         Path | None, typer.Option("--table", help="Table of parameters for C source exported before (CSV).")
     ] = None,
     urdf: Annotated[Path | None, typer.Option("--urdf", help="URDF file of the calibrated robot.")] = None,
+    kinematics: Annotated[
+        Path | None, typer.Option("--ur-kinematics", help="Universal Robots' kinematics.yaml of the calibrated robot.")
+    ] = None,
+    data: Annotated[Path | None, typer.Option("--data", help="Folder for parameters as CSV and JSON.")] = None,
+    template: Annotated[
+        Path | None,
+        typer.Option("--template", help="URDF (its meshes stay) or kinematics.yaml the robot was read from."),
+    ] = None,
     at_cycle: AtCycle = None,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
     """Export the calibrated robot for controllers and simulators."""
-    if c is None and urdf is None and table is None:
-        wrong_use("name what to write: --c FOLDER, --urdf FILE, --table FILE")
+    if all(path is None for path in (c, urdf, table, kinematics, data)):
+        wrong_use("name what to write: --c FOLDER, --urdf FILE, --table FILE, --ur-kinematics FILE, --data FOLDER")
     with answers("export", as_json, quiet) as answer:
-        from pipeline.exports import export_run
+        from pipeline.exports import Wanted, export_run
 
-        written = export_run(run_folder, c, urdf, table, at_cycle)
+        written, notes = export_run(run_folder, Wanted(c, table, urdf, kinematics, data, template), at_cycle)
         answer["files"] = [str(path) for path in written]
+        answer["warnings"] = notes
+        for sentence in notes:
+            LOG.warning(sentence)
         for path in written:
             LOG.info(str(path))
 

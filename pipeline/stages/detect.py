@@ -48,6 +48,9 @@ def sources(campaign: Campaign) -> dict[str, tuple[ImageSource, BodyFile, Survey
         for name, camera in campaign.cameras.items():
             if camera.images:
                 found[f"station/{name}"] = (camera, body_file, None)
+    use = campaign.entry.hand_eye
+    if use is not None and campaign.hand_eye is not None and campaign.hand_eye.images.images:
+        found[f"hand_eye/{use.camera.name}"] = (campaign.hand_eye.images, campaign.bodies[use.board].file, None)
     return found
 
 

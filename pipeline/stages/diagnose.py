@@ -122,7 +122,9 @@ def _result(diagnosis: Diagnosis) -> dict[str, Any]:
 
 STAGE = Stage(
     name=NAME,
-    applies=lambda campaign: campaign.entry.diagnosis.enabled,
+    applies=lambda campaign: (
+        campaign.entry.diagnosis.enabled and (campaign.measures_robot or campaign.entry.hand_eye is None)
+    ),
     work=work,
     inputs=no_files,
     settings=lambda campaign: campaign.entry.model_dump(include={"diagnosis", "model"}),

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.artifacts import CALIBRATED, IDENTIFICATION, INSTRUMENTS
+from pipeline.artifacts import CALIBRATED, HAND_EYE, IDENTIFICATION, INSTRUMENTS
 from pipeline.bodies import body_for_robot
 from pipeline.campaign import Campaign
 from pipeline.instrument_results import instrument_notes, instruments_result
@@ -208,6 +208,9 @@ def load_calibrated(run: Run, instrument: str | None = None) -> CalibratedRobot:
             )
         placed = instruments.placed[name].robot
         return placed if placed is not None and run.find(CALIBRATED) is None else instruments.seen_by(name, robot)
+    seen = run.find(HAND_EYE)
+    if robot is None and seen is not None:
+        robot = seen.robot
     if robot is not None:
         return robot
     raise InvalidInput(f"{run.folder}: holds no calibrated robot: the campaign needs a robot, poses and measurements")
@@ -215,7 +218,7 @@ def load_calibrated(run: Run, instrument: str | None = None) -> CalibratedRobot:
 
 STAGE = Stage(
     name=NAME,
-    applies=lambda campaign: campaign.robot is not None and campaign.poses is not None,
+    applies=lambda campaign: campaign.robot is not None and campaign.poses is not None and campaign.measures_robot,
     work=work,
     inputs=lambda campaign: [
         p for p in campaign.files if p.suffix.lower() in {".csv", ".yaml", ".yml", ".urdf", ".xml"}

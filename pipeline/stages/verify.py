@@ -122,7 +122,7 @@ def _write_residuals(
 
 STAGE = Stage(
     name=NAME,
-    applies=lambda campaign: campaign.robot is not None and campaign.poses is not None,
+    applies=lambda campaign: campaign.robot is not None and campaign.poses is not None and campaign.measures_robot,
     work=work,
     inputs=no_files,
     settings=lambda campaign: [campaign.name, campaign.entry.model_dump(include={"model"})],
