@@ -76,6 +76,23 @@ def run(
         LOG.info(f"results in {done.run.folder}")
 
 
+@app.command(short_help="Write a campaign.yaml for what lies in a folder.")
+def init(
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of the recordings.")],
+    quiet: Quiet = False,
+    as_json: Json = False,
+) -> None:
+    """Look at what lies in a folder and write a commented campaign.yaml; one that is there is never overwritten."""
+    with answers("init", as_json, quiet) as answer:
+        from pipeline.beginning.writing import begin_campaign
+
+        path, todo = begin_campaign(folder)
+        answer.update({"campaign": str(path), "warnings": todo})
+        for sentence in todo:
+            LOG.warning(sentence)
+        LOG.info(f"{path} written: look at it, then 'pipeline check {folder}'")
+
+
 @app.command(short_help="All faults of a campaign at once, before any long work.")
 def check(campaign: CampaignPath, quiet: Quiet = False, as_json: Json = False) -> None:
     """Look for everything that would stop a run, or is doubtful: a line each on standard output, with file and row.
