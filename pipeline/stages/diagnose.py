@@ -8,16 +8,16 @@ from pipeline import artifacts
 from pipeline.adjusted_images import findings_of
 from pipeline.bodies import body_for_robot
 from pipeline.campaign import Campaign
+from pipeline.instruments_diagnosis import diagnose_several
 from pipeline.json_io import write_json
 from pipeline.messages import LOG
 from pipeline.stages.base import Context, Outcome, Stage, no_files
 from pipeline.stages.identify import options_of
-from pipeline.stages.survey import located
 from robcal.diagnosis.content import diagnosis_content, with_exchanges, with_images
 from robcal.diagnosis.core.result import Diagnosis
 from robcal.diagnosis.images.diagnosis import ImageFinding
 from robcal.diagnosis.search.selection import SelectionSettings
-from robcal.errors import InvalidInput
+from robcal.errors import InvalidInput, located
 from robcal.files.tables import write_table
 from robcal.photogrammetry.station.contradictions import TARGET_SWAPPED
 from robcal.recipe.robot_diagnosis import Measured, RobotDiagnosis, diagnose_robot
@@ -38,7 +38,7 @@ def work(context: Context) -> Outcome:
         result = {"mismatch": content["mismatch"], "p_value": content["p_value"], "causes": _named(images.findings)}
         return Outcome({"diagnosis": result | {"heldout_px": content["heldout_px"]}}, [run.diagnosis], told)
     if campaign.instruments:
-        return Outcome(notes=["several instruments: the robot is not diagnosed"])
+        return diagnose_several(context, settings_of(campaign))
     station = run.find(artifacts.ORIENTATION)  # None where another system measured
     measured = Measured(body_for_robot(campaign, run), run.find(artifacts.POINTS), station)
     identification = run.load(artifacts.IDENTIFICATION)
@@ -123,7 +123,9 @@ def _result(diagnosis: Diagnosis) -> dict[str, Any]:
 
 STAGE = Stage(
     name=NAME,
-    applies=lambda campaign: campaign.entry.diagnosis.enabled,
+    applies=lambda campaign: (
+        campaign.entry.diagnosis.enabled and (campaign.measures_robot or campaign.entry.hand_eye is None)
+    ),
     work=work,
     inputs=no_files,
     settings=lambda campaign: campaign.entry.model_dump(include={"diagnosis", "model"}),
