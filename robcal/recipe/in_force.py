@@ -156,22 +156,37 @@ def _with_terms(folds: Folds, base: Form, full: Form, groups: Groups) -> tuple[F
         pays = found.pays_beside(weighted)
         reasons.append(_told("terms of the robot", found, pays, weighted))
         part, unpaid = (trial, unpaid) if pays else (base, dict.fromkeys(groups, found))
+    waits: dict[str, str] = {}
     if unpaid and folds.log.inferred:
-        known = not_paying(folds.delivery(full, folds.log), groups, folds.of_rows)
-        waiting = [group for group in unpaid if group not in known]
-        trial = full.without([name for group in unpaid if group in known for name in groups[group]])
-        if waiting:
-            found, weighted = folds.gain(part, trial, folds.log)
-            cost, _ = folds.gain(part, trial, stated)
-            pays = found.pays_beside(weighted) and cost.even and cost.after <= WAITING * cost.before
-            words = f"terms of the robot, where approach directions are stated ({', '.join(waiting)}),"
-            reasons.append(_told(words, found, pays, weighted))
-            part = trial if pays else part
-            unpaid = {group: gain for group, gain in unpaid.items() if not pays or group in known}
-    if unpaid:
-        reasons.append(f"not in force, as they do not pay beside the others: {', '.join(unpaid)}")
-    why = {group: f"error over blocked folds {_errors(gain, 'it')}" for group, gain in unpaid.items()}
+        part, told, waits = _with_approach(folds, part, full, groups, unpaid)
+        reasons += told
+    unpaid = {group: gain for group, gain in unpaid.items() if not set(groups[group]) <= set(part.free)}
+    left = [group for group in unpaid if group not in waits]
+    if left:
+        reasons.append(f"not in force, as they do not pay beside the others: {', '.join(left)}")
+    why = {group: waits.get(group) or f"error over blocked folds {_errors(unpaid[group], 'it')}" for group in unpaid}
     return part, reasons, {name: why[group] for group in unpaid for name in groups[group]}
+
+
+def _with_approach(
+    folds: Folds, part: Form, full: Form, groups: Groups, unpaid: Mapping[str, Gain]
+) -> tuple[Form, list[str], dict[str, str]]:
+    """Terms that pay where the approach directions are known: in force if they cost nothing where they are not stated;
+    else they wait, by group why."""
+    known = not_paying(folds.delivery(full, folds.log), groups, folds.of_rows)
+    waiting = [group for group in unpaid if group not in known]
+    if not waiting:
+        return part, [], {}
+    trial = full.without([name for group in unpaid if group in known for name in groups[group]])
+    found, weighted = folds.gain(part, trial, folds.log)
+    if not found.pays_beside(weighted):
+        return part, [], {}
+    told = f"with approach directions stated the error over blocked folds is {_errors(found, 'them')}"
+    cost, _ = folds.gain(part, trial, folds.log.as_stated())
+    if cost.even and cost.after <= WAITING * cost.before:
+        return trial, [f"{', '.join(waiting)} pay: {told}"], {}
+    why = f"waits for approach directions: {told}, without directions {_errors(cost, 'them')}"
+    return part, [f"state approach: {', '.join(waiting)}: {told}"], dict.fromkeys(waiting, why)
 
 
 def _is_move(item: Accepted) -> bool:
