@@ -29,6 +29,7 @@ from robcal.errors import InvalidInput
 from robcal.files.poses_table import Poses
 from robcal.files.robot_file import write_robot
 from robcal.files.tables import write_table
+from robcal.recipe.agreement import disagreements
 from robcal.recipe.instruments import telling_verification, verify_instruments
 from robcal.recipe.noise import noise_of
 from robcal.recipe.verdict import robot_facts
@@ -78,9 +79,10 @@ def work(context: Context) -> Outcome:
             "against the measurements as they are, those as recorded with the moves taken back"
         )
     diagnosis = read_json(run.diagnosis) if diagnosed and run.diagnosis.is_file() else None
-    judged = verdict(
-        robot_facts(identification, calibrated, poses, found.delivered, diagnosis, doubtful_coordinates(run))
-    )
+    recording = identification.recording
+    wrong = [] if instruments is not None else disagreements(found, calibrated, poses, recording, diagnosis)
+    doubts = doubtful_coordinates(run)
+    judged = verdict(robot_facts(identification, calibrated, poses, found.delivered, diagnosis, doubts, wrong))
     told = {"grade": judged.grade, "text": judged.text, "reasons": list(judged.reasons)}
     noise = noise_of(identification, calibrated, poses)
     result = {"verification": verification_result(found), "noise": _noise_result(noise), "verdict": told}

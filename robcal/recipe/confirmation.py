@@ -85,3 +85,12 @@ def _with_force(finding: Finding, in_force: InForce, final: Fit) -> Finding:
         return replace(finding, waits=in_force.measuring)
     waits = next((in_force.waits[name] for name in finding.names if name in in_force.waits), "")
     return replace(finding, waits=waits) if waits else at_fit(finding, final)
+
+
+def unlike_table(findings: Sequence[Finding]) -> list[str]:
+    """Findings whose sentence quotes other numbers than their parameters."""
+    return [
+        f"the sentence '{finding.statement}' does not quote its parameters"
+        for finding in findings
+        if finding.cause.describe(finding.parameters) not in finding.statement
+    ]

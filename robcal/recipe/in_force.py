@@ -6,6 +6,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
+import numpy as np
+
+from robcal.calibration.identifiability import repetitions
 from robcal.calibration.joint_log import JointLog
 from robcal.calibration.measurements import Rows
 from robcal.diagnosis.core.fitting import Accepted, Fit, fit
@@ -17,6 +20,8 @@ from robcal.transforms import Array
 
 Groups = Mapping[str, tuple[str, ...]]
 
+FEW = 60
+"""Different poses below which single ones are left out in place of blocks."""
 MOVED_SHARE = 0.5
 """Moves of the station are taken back where at most this share of the error stays: else the robot would speak in a
 frame that only some of the poses vouch for."""
@@ -83,13 +88,17 @@ class Folds:
 
     @cached_property
     def labels(self) -> Array:
-        """Fold (n,) of each pose."""
-        return blocked_folds(self.recording)
+        """What each pose (n,) is left out with: its block or, of few poses, its repeats alone.
 
-    @property
+        A block of few poses leaves a robot behind that is far worse than the one to be judged.
+        """
+        alike = repetitions(self.recording.q)
+        return np.asarray(alike) if int(alike.max(initial=-1)) + 1 < FEW else blocked_folds(self.recording)
+
+    @cached_property
     def of_rows(self) -> Array:
-        """Fold (m,) of each observation."""
-        return self.labels[self.recording.observations.pose]
+        """Block (m,) of each observation, by which gains are judged."""
+        return blocked_folds(self.recording)[self.recording.observations.pose]
 
     def delivery(self, form: Form, given: JointLog, freed: bool = True) -> Delivery:
         """A form fitted, and predicted from a table of poses; `freed` of faults of the measuring system."""

@@ -28,7 +28,7 @@ from robcal.photogrammetry.core.bodies import Body
 from robcal.photogrammetry.measure.measured_points import MeasuredPoints
 from robcal.photogrammetry.station.network import StationOrientation
 from robcal.physics.cause import DEVIATION, ObservationCause
-from robcal.recipe.confirmation import confirmed, with_force
+from robcal.recipe.confirmation import confirmed, unlike_table, with_force
 from robcal.recipe.evidence import Evidence, evidence_of
 from robcal.recipe.identification import Identification
 from robcal.recipe.image_findings import ImageFindings
@@ -168,7 +168,8 @@ def diagnose_robot(
         used = robot.used[kept]  # poses that the identification left out
         clean, rows = clean.subset(used), rows[used]
     delivered, relative, put, final = robot_in_force(found, log, clean, rows, in_force.form)
-    diagnosis = replace(diagnosis, findings=with_force(diagnosis.findings, in_force, final))
+    findings = with_force(diagnosis.findings, in_force, final)
+    diagnosis = replace(diagnosis, findings=findings, notes=(*diagnosis.notes, *unlike_table(findings)))
     if not in_force.diagnosed and not recording.own_station:
         delivered = found.robot  # as it was identified, so that nothing is worse than without a diagnosis
     least = estimate_noise(extended.model, clean, extended.free, extended.direct).factor
