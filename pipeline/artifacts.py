@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Generic, TypeVar
 if TYPE_CHECKING:  # a stage depends on the types that it uses, not on those of all others
     from collections.abc import Mapping, Sequence
 
-    from pipeline.stages.detect import DetectionIndex
+    from pipeline.detected_images import DetectionIndex
+    from pipeline.stages.hand_eye import HandEyeRun
     from robcal.calibration.calibrated import CalibratedRobot
     from robcal.calibration.instruments import IdentifiedInstruments
     from robcal.calibration.measurements import RobotRecording, Rows
@@ -58,6 +59,7 @@ PLACED: Artifact[RobotRecording] = Artifact("placed", "diagnose")
 """The recording in the frame of its first pose, where the station or the base moved or a zero jumped."""
 DELIVERED: Artifact[RobotVerification] = Artifact("delivered", "diagnose")
 """The verification of the robot in force."""
+HAND_EYE: Artifact[HandEyeRun] = Artifact("hand_eye", "hand_eye")
 RELATIVE_COVARIANCE: Artifact[Array] = Artifact("relative", "diagnose")
 """Covariance (p, p) of the robot's parameters where the errors of the station are known."""
 VERIFICATION: Artifact[tuple[Verification, Rows]] = Artifact("verify", "verify")

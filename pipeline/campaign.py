@@ -8,14 +8,18 @@ from typing import TypeVar
 
 import numpy as np
 
-from pipeline.campaign_schema import FORMAT, CampaignEntry, InstrumentEntry, StationCameraEntry, SurveyEntry
+from pipeline.campaign_schema import FORMAT, CampaignEntry, InstrumentEntry, StationCameraEntry, SurveyEntry, TableUse
+from pipeline.correction import module_file
 from pipeline.instrument_frames import cell_frames
 from robcal.calibration.instruments import CellFrame
 from robcal.errors import InvalidInput, RobcalError
 from robcal.files.body_file import BodyFile, check_ring_codes, read_body
 from robcal.files.camera_file import CameraFile, read_camera
 from robcal.files.camera_import import split_choice
+from robcal.files.flange_poses import read_flange_poses
+from robcal.files.foreign_tables import read_mapped_table
 from robcal.files.images import list_images
+from robcal.files.joint_logs import is_joint_log, log_of_robot, read_controller_log
 from robcal.files.measurement_tables import (
     MarksTable,
     MeasuredTable,
@@ -32,6 +36,7 @@ from robcal.files.yaml_io import YamlDocument, read_yaml
 from robcal.physics.gravity_sag import without_masses
 from robcal.robot.chain import chain_of, forward
 from robcal.robot.model import RobotModel
+from robcal.transforms import Array
 
 T = TypeVar("T")
 
@@ -78,6 +83,14 @@ class InstrumentSource:
 
 
 @dataclass(frozen=True)
+class HandEyeSource:
+    """The images of a hand-eye calibration; ``base_T_flange`` (n, 4, 4) where the campaign states it, m."""
+
+    images: ImageSource
+    base_T_flange: Array | None = None
+
+
+@dataclass(frozen=True)
 class Campaign:
     """Everything a run needs to know, in SI units.
 
@@ -96,6 +109,7 @@ class Campaign:
     cameras: Mapping[str, ImageSource]
     measurements: tuple[MeasuredTable, ...]
     instruments: Mapping[str, InstrumentSource] = field(default_factory=dict)
+    hand_eye: HandEyeSource | None = None
     notes: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     files: tuple[Path, ...] = field(default=(), repr=False)
@@ -104,6 +118,11 @@ class Campaign:
     def name(self) -> str:
         """Name of the campaign."""
         return self.entry.name
+
+    @property
+    def measures_robot(self) -> bool:
+        """Whether a station or another instrument measured the robot."""
+        return self.entry.station is not None or bool(self.measurements) or bool(self.instruments)
 
     @property
     def carried_body(self) -> str | None:
@@ -122,7 +141,8 @@ class Campaign:
 def all_sources(campaign: Campaign) -> list[ImageSource]:
     """The sources of images or marks of all surveys and cameras."""
     surveys = [body.survey for body in campaign.bodies.values() if body.survey is not None]
-    return [*surveys, *campaign.cameras.values()]
+    own = [] if campaign.hand_eye is None else [campaign.hand_eye.images]
+    return [*surveys, *campaign.cameras.values(), *own]
 
 
 def campaign_file(path: Path) -> Path:
@@ -200,10 +220,11 @@ class _Reader:
             self.faults.extend(error.faults if isinstance(error, InvalidInput) else [str(error)])
         return None
 
-    def _rows(self, name: str, read: Callable[[Table], T]) -> T:
+    def _rows(self, use: TableUse, read: Callable[[Table], T]) -> T:
         """What a table says; where faults are noted, what its sound rows say."""
+        path, foreign = self._file(use.file), use.table_map()
         try:
-            table = read_table(self._file(name))
+            table = read_table(path) if foreign is None else read_mapped_table(path, foreign)
         except FaultyRows as error:
             if self.faults is None:
                 raise
@@ -218,13 +239,18 @@ class _Reader:
                 self.faults.extend(error.faults)
                 table = error.rest
 
-    def _poses(self, name: str, robot: RobotModel | None) -> Poses:
+    def _poses(self, use: TableUse, robot: RobotModel | None) -> Poses:
+        if use.table_map() is None and is_joint_log(self._place(use.file)):
+            table = log_of_robot(read_controller_log(self._file(use.file)), robot)
+            self.pose_names = table.columns["pose"]
+            return poses_of(table, robot, robot.payloads if robot else ())
+
         def read(table: Table) -> Poses:
             if not self.pose_names and table.has("pose"):
                 self.pose_names = table.columns["pose"]
             return poses_of(table, robot, robot.payloads if robot else ())
 
-        return self._rows(name, read)
+        return self._rows(use, read)
 
     def read(self) -> Campaign:
         entry = self.entry
@@ -242,6 +268,9 @@ class _Reader:
                 "the robot file states no masses (mass_kg, cog_mm): sag under the arm's own weight is identified where "
                 "the poses show it, but what another payload does to the arm cannot be predicted"
             )
+        hand_eye = self._part(partial(self._hand_eye, poses))
+        if hand_eye is not None and poses is None:
+            poses = self._flange_poses()
         cameras = self._part(partial(self._station, poses)) or {}
         if poses is None and entry.poses is None and entry.station is not None:
             poses = self._poses_from_images(cameras)
@@ -257,13 +286,14 @@ class _Reader:
             cameras=cameras,
             measurements=measurements,
             instruments=instruments,
+            hand_eye=hand_eye,
             notes=tuple(self.notes),
             warnings=tuple(self.warnings),
             files=tuple(dict.fromkeys(self.files)),
         )
 
     def _tables(
-        self, names: Sequence[str], robot: RobotModel | None, poses: Poses | None, bodies: Mapping[str, BodySource]
+        self, uses: Sequence[TableUse], robot: RobotModel | None, poses: Poses | None, bodies: Mapping[str, BodySource]
     ) -> tuple[MeasuredTable, ...]:
         known = poses.names if poses is not None else ()
         sound = self.faults is None or known == self.pose_names
@@ -277,7 +307,7 @@ class _Reader:
             self._check_targets(table, found, bodies)
             return found
 
-        found = [self._part(partial(self._rows, name, read)) for name in names]
+        found = [self._part(partial(self._rows, use, read)) for use in uses]
         tables = tuple(table for table in found if table is not None)
         for table in tables:
             self.warnings.extend(table.notes)
@@ -338,6 +368,14 @@ class _Reader:
                 ("instruments", name, "pulley"),
                 f"instrument '{name}' has {table.kind}: a pulley belongs to distances, and its axis needs a direction",
             )
+        for key in ("tension_N", "correction"):
+            if getattr(use, key) is not None and table.kind != "distances":
+                raise self._error(
+                    ("instruments", name, key),
+                    f"instrument '{name}' has {table.kind}: '{key}' belongs to a wire's lengths",
+                )
+        if use.correction is not None:
+            self.files.extend(module_file(use.correction, self.path.parent))
 
     def _error(self, place: tuple[str | int, ...], message: str) -> InvalidInput:
         line = self.document.line(place)
@@ -365,12 +403,49 @@ class _Reader:
             raise self._error(("measurements",), "measurements need a robot or a body: add 'robot: robot.yaml'")
         if entry.robot is not None and entry.poses is None and (measured or entry.station is not None):
             raise self._error(("robot",), "a robot needs its joint angles: add 'poses: poses.csv'")
-        if not (surveyed or measured or entry.station is not None):
-            raise self._error((), "nothing to work on: give a body a 'survey', or add a 'station' or 'measurements'")
+        if not (surveyed or measured or entry.station is not None or entry.hand_eye is not None):
+            raise self._error(
+                (), "nothing to work on: give a body a 'survey', or add a 'station', 'measurements' or 'hand_eye'"
+            )
+        self._check_hand_eye()
         carried = entry.station.body if entry.station else None
         for key, place in ((entry.body, ("body",)), (carried, ("station", "body"))):
             if key is not None and key not in entry.bodies:
                 raise self._error(place, f"there is no body '{key}' under 'bodies'{proposal(key, list(entry.bodies))}")
+
+    def _check_hand_eye(self) -> None:
+        entry = self.entry
+        use = entry.hand_eye
+        if use is None:
+            return
+        if use.board not in entry.bodies:
+            told = f"there is no body '{use.board}' under 'bodies'{proposal(use.board, list(entry.bodies))}"
+            raise self._error(("hand_eye", "board"), told)
+        driven = entry.robot is not None and entry.poses is not None
+        if driven == (use.flange is not None):
+            raise self._error(
+                ("hand_eye",),
+                "a hand-eye calibration needs to know where the flange was: either 'robot' and 'poses' (joint angles), "
+                "or 'flange: frames.csv' (pose, x_mm ... yaw_deg of the flange in base coordinates)",
+            )
+        if use.camera.hold and use.camera.calibration is None:
+            raise self._error(("hand_eye", "camera", "hold"), "'hold: true' needs the 'calibration' that is to be held")
+
+    def _hand_eye(self, poses: Poses | None) -> HandEyeSource | None:
+        use = self.entry.hand_eye
+        if use is None:
+            return None
+        source = self._source(use.camera, use.camera.calibration, ("hand_eye", "camera"), "the camera of 'hand_eye'")
+        if use.camera.images is not None:
+            source = replace(source, images=self._by_stem(source.images, use.camera.name))
+        if use.flange is None:
+            return HandEyeSource(self._match_poses(source, use.camera.name, poses))
+        poses, frames = read_flange_poses(self._place(use.flange))
+        return HandEyeSource(self._match_poses(source, use.camera.name, poses), frames)
+
+    def _flange_poses(self) -> Poses | None:
+        use = self.entry.hand_eye
+        return None if use is None or use.flange is None else read_flange_poses(self._file(use.flange))[0]
 
     def _robot(self) -> RobotModel | None:
         use = self.entry.robot
@@ -392,6 +467,8 @@ class _Reader:
         file = read_body(self._file(use.targets))
         station = self.entry.station
         watched = station is not None and station.body == name and any(c.images for c in station.cameras.values())
+        seen = self.entry.hand_eye
+        watched |= seen is not None and seen.board == name and seen.camera.images is not None
         if watched or (use.survey is not None and use.survey.images):
             check_ring_codes(file)
         if use.survey is None:
@@ -413,7 +490,7 @@ class _Reader:
         if start is not None:
             size = (start.camera.width, start.camera.height)
         if entry.observations is not None:
-            marks = self._rows(entry.observations, marks_of)
+            marks = self._rows(TableUse(file=entry.observations), marks_of)
             check_marks(marks, size)
             return ImageSource({}, marks, start, start_path, size)
         folder = self._place(str(entry.images)).absolute()  # the report looks for them from anywhere

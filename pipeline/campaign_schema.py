@@ -5,6 +5,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field
 
+from robcal.files.foreign_tables import Orientation, TableMap
 from robcal.files.robot_file import PayloadEntry
 from robcal.files.schemas import Entry, NotNegative, Positive, Text, Triple, Whole
 
@@ -33,7 +34,7 @@ def _pair(value: Any) -> Any:
 
 
 def _one_or_many(value: Any) -> Any:
-    return value if isinstance(value, list) else [value]
+    return [_file_alone(item) for item in (value if isinstance(value, list) else [value])]
 
 
 class ScaleBarEntry(Entry):
@@ -69,6 +70,12 @@ class SurveyEntry(Entry):
     check_lengths: list[CheckLengthEntry] = Field(default_factory=list)
     datum: Literal["free", "bars"] | FixedDatum = "free"
 
+    @property
+    def ends(self) -> frozenset[int]:
+        """Targets of scale bars and check lengths."""
+        pairs = [*(bar.targets for bar in self.scale_bars), *(length.targets for length in self.check_lengths)]
+        return frozenset(number for pair in pairs for number in pair)
+
 
 class BodyUse(Entry):
     """A body of the campaign."""
@@ -91,6 +98,26 @@ class StationEntry(Entry):
 
     cameras: dict[str, StationCameraEntry]
     body: Text
+
+
+class HandEyeCameraEntry(StationCameraEntry):
+    """The camera of a hand-eye calibration: an image per pose; ``hold`` keeps its calibration as it is."""
+
+    name: Text = "camera"
+    hold: bool = False
+
+
+class HandEyeEntry(Entry):
+    """A camera in the hand of the robot, or beside it, and the board that it sees.
+
+    ``flange`` is a table of flange frames in base coordinates, in place of a robot and its joint angles.
+    """
+
+    camera: HandEyeCameraEntry
+    mounted: Literal["hand", "world"] = "hand"
+    board: Text
+    flange: Text | None = None
+    board_scale_ppm: Positive | None = None
 
 
 class QualityEntry(Entry):
@@ -134,6 +161,25 @@ class RobotUse(Entry):
     tip_link: Text | None = None
 
 
+class TableUse(Entry):
+    """A table, and how to read one of another program."""
+
+    file: Text
+    columns: dict[Text, Text] = Field(default_factory=dict)
+    sep: Literal[",", ";", "|", ":", "\t", "\\t", "tab", "space", " "] = ","
+    decimal: Literal[".", ","] = "."
+    skip_rows: Annotated[int, Field(ge=0, le=100_000)] = 0
+    header: bool = True
+    orientation: Orientation = "rpy"
+
+    def table_map(self) -> TableMap | None:
+        """How to read the table; None where it is one of the project's own."""
+        given = self.model_dump(exclude={"file"}, exclude_defaults=True)
+        return TableMap(**given) if given else None
+
+
+Tables = Annotated[list[TableUse], BeforeValidator(_one_or_many)]
+
 Coordinate = Literal["x", "y", "z", "roll", "pitch", "yaw"]
 
 
@@ -148,20 +194,22 @@ class CellFrameEntry(Entry):
 
 
 class PulleyEntry(Entry):
-    """A wheel over which a wire leaves: held, not identified."""
+    """A wheel over which a wire leaves; its radius may be identified."""
 
     radius_mm: Positive
     axis: Triple = (0.0, 0.0, 1.0)
-    free: Literal["none"] = "none"
+    free: Literal["none", "radius"] = "none"
 
 
 class InstrumentEntry(Entry):
     """A measuring system with a world and a tool of its own."""
 
-    measurements: Annotated[list[Text], BeforeValidator(_one_or_many)]
+    measurements: Tables
     world_T_base: CellFrameEntry | None = None
     flange_T_tool: CellFrameEntry | None = None
     pulley: PulleyEntry | None = None
+    tension_N: Positive | None = None
+    correction: Text | None = None
     mounted: Literal["world", "hand"] = "world"
     body: Text | None = None
 
@@ -172,12 +220,13 @@ class CampaignEntry(Entry):
     format: Literal["robcal/campaign-1"]
     name: Annotated[str, BeforeValidator(_folder_name)]
     robot: Annotated[RobotUse | None, BeforeValidator(_file_alone)] = None
-    poses: Text | None = None
+    poses: Annotated[TableUse | None, BeforeValidator(_file_alone)] = None
     payloads: dict[str, PayloadEntry] = Field(default_factory=dict)
     bodies: dict[str, BodyUse] = Field(default_factory=dict)
     station: StationEntry | None = None
+    hand_eye: HandEyeEntry | None = None
     quality: QualityEntry = QualityEntry()
-    measurements: Annotated[list[Text], BeforeValidator(_one_or_many)] = Field(default_factory=list)
+    measurements: Tables = Field(default_factory=list)
     body: Text | None = None
     instruments: dict[Annotated[str, BeforeValidator(_instrument_name)], InstrumentEntry] = Field(default_factory=dict)
     same_world: list[list[Text]] = Field(default_factory=list)

@@ -14,6 +14,7 @@ from pipeline.command_line import CampaignPath, InstrumentName, Json, Quiet, Run
 from pipeline.drift_commands import app as drift_app
 from pipeline.mastering_commands import mastering
 from pipeline.messages import LOG
+from pipeline.program_commands import programs
 
 app = typer.Typer(
     name="pipeline",
@@ -26,6 +27,7 @@ app = typer.Typer(
 app.add_typer(cell, name="cell")
 app.add_typer(drift_app, name="drift")
 app.add_typer(mastering)
+app.add_typer(programs)
 
 RunOrDrift = Annotated[
     Path, typer.Argument(metavar="RUN", help="Run folder of a finished campaign, or state of a drift control.")
@@ -72,6 +74,23 @@ def run(
         done = run_campaign(campaign, out, until=until, start=start, workers=workers)
         answer.update(_summary(done))
         LOG.info(f"results in {done.run.folder}")
+
+
+@app.command(short_help="Write a campaign.yaml for what lies in a folder.")
+def init(
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of the recordings.")],
+    quiet: Quiet = False,
+    as_json: Json = False,
+) -> None:
+    """Look at what lies in a folder and write a commented campaign.yaml; one that is there is never overwritten."""
+    with answers("init", as_json, quiet) as answer:
+        from pipeline.beginning.writing import begin_campaign
+
+        path, todo = begin_campaign(folder)
+        answer.update({"campaign": str(path), "warnings": todo})
+        for sentence in todo:
+            LOG.warning(sentence)
+        LOG.info(f"{path} written: look at it, then 'pipeline check {folder}'")
 
 
 @app.command(short_help="All faults of a campaign at once, before any long work.")
@@ -249,18 +268,29 @@ def export(
         Path | None, typer.Option("--table", help="Table of parameters for C source exported before (CSV).")
     ] = None,
     urdf: Annotated[Path | None, typer.Option("--urdf", help="URDF file of the calibrated robot.")] = None,
+    kinematics: Annotated[
+        Path | None, typer.Option("--ur-kinematics", help="Universal Robots' kinematics.yaml of the calibrated robot.")
+    ] = None,
+    data: Annotated[Path | None, typer.Option("--data", help="Folder for parameters as CSV and JSON.")] = None,
+    template: Annotated[
+        Path | None,
+        typer.Option("--template", help="URDF (its meshes stay) or kinematics.yaml the robot was read from."),
+    ] = None,
     at_cycle: AtCycle = None,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
     """Export the calibrated robot for controllers and simulators."""
-    if c is None and urdf is None and table is None:
-        wrong_use("name what to write: --c FOLDER, --urdf FILE, --table FILE")
+    if all(path is None for path in (c, urdf, table, kinematics, data)):
+        wrong_use("name what to write: --c FOLDER, --urdf FILE, --table FILE, --ur-kinematics FILE, --data FOLDER")
     with answers("export", as_json, quiet) as answer:
-        from pipeline.exports import export_run
+        from pipeline.exports import Wanted, export_run
 
-        written = export_run(run_folder, c, urdf, table, at_cycle)
+        written, notes = export_run(run_folder, Wanted(c, table, urdf, kinematics, data, template), at_cycle)
         answer["files"] = [str(path) for path in written]
+        answer["warnings"] = notes
+        for sentence in notes:
+            LOG.warning(sentence)
         for path in written:
             LOG.info(str(path))
 

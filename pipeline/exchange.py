@@ -8,9 +8,8 @@ import numpy as np
 from pipeline.mastering import keep_calibrated, measured_campaign, recording_for
 from pipeline.runs import open_run
 from pipeline.stages.identify import load_calibrated, require_robot
-from pipeline.stages.survey import located
 from robcal.cell.exchange import exchange, transfer
-from robcal.errors import InvalidInput, NotIdentifiable
+from robcal.errors import InvalidInput, NotIdentifiable, located
 from robcal.files.poses_table import joint_columns, read_poses
 from robcal.files.tables import write_table
 

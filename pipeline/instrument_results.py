@@ -23,10 +23,27 @@ def instruments_result(
             "world_T_base": _frame(placed.world_T_base, placed.covariance[:6, :6]),
             "flange_T_tool": _frame(placed.flange_T_tool, placed.covariance[6:, 6:]),
             "held": list(placed.held),
+            "wire": _wire(placed.wire),
             "verification": (verified or {}).get(name),
         }
         for name, placed in found.placed.items()
     }
+
+
+WIRE_UNITS = {"radius": ("radius_mm", 1e3), "stretch": ("ppm_per_m", 1e6), "scale": ("ppm", 1e6), "offset": ("mm", 1e3)}
+
+
+def _wire(found: Mapping[str, tuple[float, float]]) -> dict[str, dict[str, float]]:
+    """Identified parameters of a wire in the units of people, with their standard deviations."""
+    out = {}
+    for kind, (value, sigma) in found.items():
+        if kind == "sag":  # the square of the mass a length is what is identified
+            mass = float(np.sqrt(max(value, 0.0)))
+            out["g_per_m"] = {"value": 1e3 * mass, "sigma": 1e3 * sigma / (2.0 * mass) if mass > 0 else float("inf")}
+            continue
+        name, unit = WIRE_UNITS[kind]
+        out[name] = {"value": unit * value, "sigma": unit * sigma}
+    return out
 
 
 def _frame(T: Array, covariance: Array) -> dict[str, list[float]]:

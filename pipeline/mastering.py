@@ -14,14 +14,13 @@ from pipeline.runner import run_campaign
 from pipeline.runs import Run, StageRecord, open_run
 from pipeline.stages.identify import load_calibrated, require_robot
 from pipeline.stages.observations import build_recording
-from pipeline.stages.survey import located
 from robcal.calibration.calibrated import CalibratedRobot
 from robcal.calibration.joint_log import JointLog
 from robcal.calibration.measurements import RobotRecording, Rows
 from robcal.calibration.observations import FrameObservations
 from robcal.cell.mastering import Mastering, master
 from robcal.cell.notch import notch_extremum
-from robcal.errors import DegenerateGeometry, InvalidInput, NotIdentifiable
+from robcal.errors import DegenerateGeometry, InvalidInput, NotIdentifiable, located
 from robcal.files.poses_table import Poses, read_poses
 from robcal.files.robot_file import write_robot
 from robcal.files.tables import read_table

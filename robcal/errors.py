@@ -35,3 +35,12 @@ class NotIdentifiable(RobcalError):
     def __init__(self, message: str, parameters: Iterable[str] = ()) -> None:
         super().__init__(message)
         self.parameters: tuple[str, ...] = tuple(parameters)
+
+
+def located(error: RobcalError, where: str) -> RobcalError:
+    """The same error with the place in front of its message."""
+    if isinstance(error, NotIdentifiable):
+        return NotIdentifiable(f"{where}: {error}", error.parameters)
+    if isinstance(error, InvalidInput):
+        return InvalidInput(f"{where}: {error}")
+    return DegenerateGeometry(f"{where}: {error}") if isinstance(error, DegenerateGeometry) else error

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 from pipeline.report.blocks import Chapter
 from pipeline.report.diagnosis_chapter import diagnosis_chapter
+from pipeline.report.hand_eye_chapter import hand_eye_chapter
 from pipeline.report.image_chapters import image_chapter, residual_chapter
 from pipeline.report.material import Material
 from pipeline.report.measurement_chapters import measurement_chapter
@@ -14,6 +15,7 @@ from pipeline.report.survey_chapters import network_chapter, survey_chapter
 from pipeline.report.verification_chapter import verification_chapter
 
 _RESULTS: tuple[Callable[[Material], Chapter], ...] = (
+    hand_eye_chapter,
     verification_chapter,
     diagnosis_chapter,
     rejected_chapter,

@@ -9,9 +9,9 @@ from pipeline import artifacts
 from pipeline.artifacts import Artifact
 from pipeline.campaign import Campaign, read_campaign
 from pipeline.codec import StaleCache
+from pipeline.detected_images import DetectionIndex
 from pipeline.json_io import read_json
 from pipeline.runs import Run, campaign_of, run_file
-from pipeline.stages.detect import DetectionIndex
 from pipeline.stages.registry import STAGES
 from robcal.calibration.calibrated import CalibratedRobot
 from robcal.calibration.measurements import Rows

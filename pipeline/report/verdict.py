@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.artifacts import CORRECTED
+from pipeline.artifacts import CORRECTED, HAND_EYE
 from pipeline.report.blocks import Grade, KeyFigure, Verdict
 from pipeline.report.diagnosis_chapter import short_statement
+from pipeline.report.hand_eye_chapter import hand_eye_verdict
 from pipeline.report.material import Material
 from pipeline.report.style import number, percent, probability
 from pipeline.report.verification_chapter import error_table, noise_by_tool
@@ -27,6 +28,9 @@ def verdict_of(material: Material) -> Verdict:
     """Verdict on whatever the run holds: a robot, a station, a survey."""
     if material.verification is not None:
         return _robot(material, material.verification[0])
+    seen = material.find(HAND_EYE)
+    if seen is not None:
+        return hand_eye_verdict(material, seen)
     if material.surveys or material.station is not None:
         return _measuring(material)
     if material.stages:

@@ -12,12 +12,11 @@ from pipeline.json_io import write_json
 from pipeline.messages import LOG
 from pipeline.stages.base import Context, Outcome, Stage, no_files
 from pipeline.stages.identify import options_of
-from pipeline.stages.survey import located
 from robcal.diagnosis.content import diagnosis_content, with_exchanges, with_images
 from robcal.diagnosis.core.result import Diagnosis
 from robcal.diagnosis.images.diagnosis import ImageFinding
 from robcal.diagnosis.search.selection import SelectionSettings
-from robcal.errors import InvalidInput
+from robcal.errors import InvalidInput, located
 from robcal.files.tables import write_table
 from robcal.photogrammetry.station.contradictions import TARGET_SWAPPED
 from robcal.recipe.robot_diagnosis import Measured, RobotDiagnosis, diagnose_robot
@@ -123,7 +122,9 @@ def _result(diagnosis: Diagnosis) -> dict[str, Any]:
 
 STAGE = Stage(
     name=NAME,
-    applies=lambda campaign: campaign.entry.diagnosis.enabled,
+    applies=lambda campaign: (
+        campaign.entry.diagnosis.enabled and (campaign.measures_robot or campaign.entry.hand_eye is None)
+    ),
     work=work,
     inputs=no_files,
     settings=lambda campaign: campaign.entry.model_dump(include={"diagnosis", "model"}),

@@ -4,26 +4,26 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.artifacts import CALIBRATED, IDENTIFICATION, INSTRUMENTS
+from pipeline.artifacts import CALIBRATED, HAND_EYE, IDENTIFICATION, INSTRUMENTS
 from pipeline.bodies import body_for_robot
 from pipeline.campaign import Campaign
 from pipeline.instrument_results import instrument_notes, instruments_result
 from pipeline.runs import Run
 from pipeline.stages.base import Context, Outcome, Stage
-from pipeline.stages.observations import build_instruments, build_recording
-from pipeline.stages.survey import located
+from pipeline.stages.observations import build_instruments, build_recording, corrections_of
 from robcal.calibration.calibrated import CalibratedRobot
 from robcal.calibration.identification import IdentifiedRobot, IdentifyOptions
 from robcal.calibration.measurements import RobotRecording, Rows
 from robcal.calibration.recording_errors import mirror_residuals
 from robcal.calibration.recording_errors.search import fault_of
-from robcal.errors import InvalidInput, RobcalError
+from robcal.errors import InvalidInput, RobcalError, located
 from robcal.files.poses_table import Poses
 from robcal.files.robot_file import write_robot
 from robcal.files.schemas import proposal
 from robcal.photogrammetry.survey.given_coordinates import GivenCoordinates
 from robcal.recipe.identification import identify_robot
-from robcal.recipe.instruments import identify_from_instruments, leading_identification
+from robcal.recipe.instruments import leading_identification
+from robcal.recipe.wires import identify_with_corrections
 from robcal.robot.kernel import Kernel
 from robcal.robot.model import RobotModel
 
@@ -75,7 +75,9 @@ def _with_instruments(context: Context) -> Outcome:
     robot, poses = require_robot(campaign)
     options = options_of(campaign, stated=True)
     try:
-        found = identify_from_instruments(robot, poses, build_instruments(campaign, run), options)
+        found = identify_with_corrections(
+            robot, poses, build_instruments(campaign, run), corrections_of(campaign), options
+        )
     except InvalidInput as error:
         raise located(error, str(campaign.path)) from None
     leading = leading_identification(found)
@@ -206,6 +208,9 @@ def load_calibrated(run: Run, instrument: str | None = None) -> CalibratedRobot:
             )
         placed = instruments.placed[name].robot
         return placed if placed is not None and run.find(CALIBRATED) is None else instruments.seen_by(name, robot)
+    seen = run.find(HAND_EYE)
+    if robot is None and seen is not None:
+        robot = seen.robot
     if robot is not None:
         return robot
     raise InvalidInput(f"{run.folder}: holds no calibrated robot: the campaign needs a robot, poses and measurements")
@@ -213,7 +218,7 @@ def load_calibrated(run: Run, instrument: str | None = None) -> CalibratedRobot:
 
 STAGE = Stage(
     name=NAME,
-    applies=lambda campaign: campaign.robot is not None and campaign.poses is not None,
+    applies=lambda campaign: campaign.robot is not None and campaign.poses is not None and campaign.measures_robot,
     work=work,
     inputs=lambda campaign: [
         p for p in campaign.files if p.suffix.lower() in {".csv", ".yaml", ".yml", ".urdf", ".xml"}

@@ -2,17 +2,17 @@
 
 import numpy as np
 
-from pipeline.artifacts import POINTS
+from pipeline.artifacts import MARKS, ORIENTATION, POINTS
 from pipeline.bodies import surveyed_or_given
 from pipeline.campaign import Campaign
 from pipeline.runs import Run
 from pipeline.stages.base import Context, Outcome, Stage
-from pipeline.stages.orient import station_points
 from robcal.errors import InvalidInput
 from robcal.files.poses_table import Poses
 from robcal.files.tables import write_table
 from robcal.photogrammetry.measure.exchanged import exchanged_back, find_exchanges
 from robcal.photogrammetry.measure.measured_points import MeasuredPoints
+from robcal.photogrammetry.measure.points import measure_points
 
 NAME = "measure"
 
@@ -27,7 +27,11 @@ def work(context: Context) -> Outcome:
     campaign, run = context.campaign, context.run
     if campaign.poses is None:
         raise InvalidInput(f"{campaign.path}: no poses: add 'poses: poses.csv'")
-    points = station_points(run) if campaign.entry.station is not None else _right_numbers(campaign, run)
+    points = (
+        measure_points(run.load(ORIENTATION), run.load(MARKS))
+        if campaign.entry.station is not None
+        else _right_numbers(campaign, run)
+    )
     write_points(run, campaign.poses, points)
     names = campaign.poses.names
     notes = [f"pose '{names[p]}': the rays of the cameras contradict one another" for p in points.inconsistent_poses]
@@ -60,8 +64,8 @@ def points_from_tables(campaign: Campaign) -> MeasuredPoints:
     tables = campaign.measured("points")
     stated = [table.covariance is not None for table in tables]
     if any(stated) and not all(stated):
-        silent = tables[stated.index(False)].path
-        raise InvalidInput(f"{silent}: states no uncertainty while other tables do: add the column sigma_mm")
+        without = tables[stated.index(False)].path
+        raise InvalidInput(f"{without}: states no uncertainty while other tables do: add the column sigma_mm")
     covariance = np.concatenate([t.covariance for t in tables if t.covariance is not None]) if all(stated) else None
     return MeasuredPoints.from_table(
         np.concatenate([t.pose for t in tables]),
@@ -95,7 +99,10 @@ STAGE = Stage(
         *(table.path for table in campaign.measured("points")),
         *(body.file.path for body in campaign.bodies.values()),
     ],
-    settings=lambda campaign: [list(campaign.poses.names) if campaign.poses else [], campaign.entry.measurements],
+    settings=lambda campaign: [
+        list(campaign.poses.names) if campaign.poses else [],
+        [m.model_dump() for m in campaign.entry.measurements],
+    ],
     after=("detect", "survey", "orient"),
     module=__name__,
 )

@@ -6,14 +6,16 @@ from pipeline.artifacts import FRAMES, POINTS
 from pipeline.bodies import body_for_robot, surveyed_or_given
 from pipeline.campaign import Campaign
 from pipeline.campaign_schema import InstrumentEntry
+from pipeline.correction import load_correction
 from pipeline.runs import Run
 from robcal.calibration.instruments import Instrument
 from robcal.calibration.measurements import RobotObservations, RobotRecording, frame_observations, used_points
 from robcal.calibration.observations import DistanceObservations, FrameObservations
-from robcal.calibration.pulley import Pulley
+from robcal.calibration.wire import USUAL_TENSION, Wire
 from robcal.errors import InvalidInput
 from robcal.files.recordings import observations_of
 from robcal.photogrammetry.core.bodies import Body
+from robcal.recipe.wires import Correction
 
 
 def build_instruments(campaign: Campaign, run: Run) -> list[Instrument]:
@@ -32,18 +34,38 @@ def build_instruments(campaign: Campaign, run: Run) -> list[Instrument]:
             seen = source.entry.body if source.entry is not None and source.entry.body else campaign.carried_body
             body = surveyed_or_given(campaign, run, seen) if seen is not None else None
             tables = source.tables or ()
-            observations = tuple(_over_pulley(observations_of(table, body), source.entry) for table in tables)
+            observations = tuple(_on_wire(observations_of(table, body), source.entry) for table in tables)
             stated = all(table.covariance is not None for table in tables)
             recording = RobotRecording(observations, observations, stated)
-        out.append(Instrument(name, recording, source.world, source.tool))
+        pulley = None if source.entry is None else source.entry.pulley
+        wire = ("radius",) if pulley is not None and pulley.free == "radius" else ()
+        out.append(Instrument(name, recording, source.world, source.tool, wire))
     return out
 
 
-def _over_pulley(made: RobotObservations, entry: InstrumentEntry | None) -> RobotObservations:
-    """Lengths as drawn over the pulley of their instrument, if it has one."""
-    if entry is None or entry.pulley is None or not isinstance(made, DistanceObservations):
+def _on_wire(made: RobotObservations, entry: InstrumentEntry | None) -> RobotObservations:
+    """Lengths as the wire of their instrument is drawn, where anything of it is stated."""
+    if entry is None or not isinstance(made, DistanceObservations) or not (entry.pulley or entry.tension_N):
         return made
-    return replace(made, pulley=Pulley(entry.pulley.radius_mm / 1000.0, entry.pulley.axis))
+    wire = Wire(tension=entry.tension_N or USUAL_TENSION)
+    if entry.pulley is not None:
+        wire = replace(wire, radius=entry.pulley.radius_mm / 1000.0, axis=entry.pulley.axis)
+    return replace(made, wire=wire)
+
+
+def corrections_of(campaign: Campaign) -> dict[str, Correction]:
+    """Functions from outside that correct the lengths of wires, by the name of the instrument.
+
+    Raises
+    ------
+    InvalidInput : no such module or function.
+    """
+    entries = campaign.entry.instruments.items()
+    return {
+        name: load_correction(entry.correction, campaign.path.parent, f"instrument '{name}'")
+        for name, entry in entries
+        if entry.correction is not None
+    }
 
 
 def build_recording(campaign: Campaign, run: Run, body: Body | None) -> RobotRecording:

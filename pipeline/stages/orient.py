@@ -12,25 +12,23 @@ from pipeline.adjusted_images import image_covariates
 from pipeline.artifacts import CORRECTED_IMAGES, DETECTED, MARKS, ORIENTATION, SHAPES
 from pipeline.bodies import surveyed_or_given
 from pipeline.campaign import Campaign, ImageSource
+from pipeline.detected_images import load_detections
+from pipeline.result_sections import station_section
 from pipeline.runs import Run
 from pipeline.stages.base import Context, Outcome, Stage
-from pipeline.stages.detect import load_detections
 from pipeline.stages.identify import options_of
-from pipeline.stages.survey import located, size_of_marks
-from robcal.errors import InvalidInput, RobcalError
+from robcal.errors import InvalidInput, RobcalError, located
 from robcal.files.camera_file import CameraFile, write_camera
-from robcal.files.measurement_tables import MarksTable
 from robcal.files.poses_table import Poses
 from robcal.imaging.detections import Detections
 from robcal.photogrammetry.core.bodies import Body
 from robcal.photogrammetry.core.camera import INTRINSIC_NAMES, Camera
-from robcal.photogrammetry.measure.measured_points import MeasuredPoints
-from robcal.photogrammetry.measure.points import measure_points
 from robcal.photogrammetry.station.identify import identify_station
 from robcal.photogrammetry.station.network import StationMarks, StationOrientation
 from robcal.photogrammetry.station.seen_normals import ellipses_of
 from robcal.recipe.robot_witness import robot_misfit
-from robcal.recipe.station import StationImages, orient_images
+from robcal.recipe.station import StationImages, marks_of_table, orient_images
+from robcal.recipe.survey import size_of_marks
 
 NAME = "orient"
 
@@ -77,7 +75,7 @@ def work(context: Context) -> Outcome:
     notes += [f.statement for f in found.corrected] + [e.statement for e in orientation.evidence]
     whole = [r for r in orientation.rejected if r.target < 0]
     notes += [f"camera {r.camera}, pose '{poses.names[r.pose]}': {r.reason}" for r in whole]
-    return Outcome({"station": _result(orientation, marks)}, outputs, notes)
+    return Outcome({"station": station_section(orientation, marks)}, outputs, notes)
 
 
 def _check_body(campaign: Campaign, body: Body, name: str) -> None:
@@ -112,7 +110,7 @@ def _marks(
 ) -> tuple[dict[str, StationMarks], tuple[tuple[str, int, str], ...]]:
     place = {name: i for i, name in enumerate(poses.names)}
     given = {
-        name: _from_table(source.marks, body, place)
+        name: marks_of_table(source.marks, body, place)
         for name, source in campaign.cameras.items()
         if source.marks is not None
     }
@@ -121,15 +119,6 @@ def _marks(
     identified = identify_station(detections, body, start)
     marks = {name: given.get(name) or identified.marks.get(name) for name in campaign.cameras}
     return {name: m for name, m in marks.items() if m is not None}, identified.problems
-
-
-def _from_table(table: MarksTable, body: Body, place: Mapping[str, int]) -> StationMarks:
-    listed = body.index(table.target) >= 0
-    if not listed.any():
-        raise InvalidInput(f"{table.path}: none of its targets is on body '{body.name}': check the ids")
-    covariance = table.sigma[listed][:, None, None] ** 2 * np.eye(2)
-    pose = np.array([place[image] for image in table.image], dtype=np.int64)
-    return StationMarks(pose[listed], table.target[listed], table.xy[listed], covariance)
 
 
 def _usable(
@@ -181,34 +170,6 @@ def _write_cameras(campaign: Campaign, run: Run, orientation: StationOrientation
         write_camera(run.camera(name), content, f"oriented in campaign {campaign.name}")
         paths.append(run.camera(name))
     return paths
-
-
-def _result(orientation: StationOrientation, marks: Mapping[str, StationMarks]) -> dict[str, Any]:
-    return {
-        "cameras": {
-            name: {
-                "marks": len(marks[name]),
-                "images": len(np.unique(marks[name].pose)),
-                "noise_factor": orientation.noise.get(name),
-                "free_interior": list(orientation.free_interior.get(name, ())),
-            }
-            for name in orientation.names
-        },
-        "poses": len(orientation.poses),
-        "sigma0": orientation.sigma0,
-        "rms_px": orientation.rms_px,
-        "redundancy": orientation.redundancy_total,
-        "rejected": len(orientation.rejected),
-        "evidence": [e.name for e in orientation.evidence],
-        "converged": orientation.converged,
-    }
-
-
-def station_points(run: Run) -> MeasuredPoints:
-    """Targets in the world from the oriented station and all identified marks."""
-    orientation = run.load(ORIENTATION)
-    marks = run.load(MARKS)
-    return measure_points(orientation, marks)
 
 
 STAGE = Stage(

@@ -1,6 +1,6 @@
 """The stages in the order in which they run."""
 
-from pipeline.stages import detect, diagnose, frames, identify, measure, orient, report, survey, verify
+from pipeline.stages import detect, diagnose, frames, hand_eye, identify, measure, orient, report, survey, verify
 from pipeline.stages.base import Stage
 
 STAGES: tuple[Stage, ...] = (
@@ -12,5 +12,6 @@ STAGES: tuple[Stage, ...] = (
     identify.STAGE,
     diagnose.STAGE,
     verify.STAGE,
+    hand_eye.STAGE,
     report.STAGE,
 )

@@ -1,7 +1,6 @@
 """Stage survey: bundle adjustment of each body that was photographed, with self-calibration of the camera."""
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -9,19 +8,20 @@ import numpy as np
 from pipeline import artifacts
 from pipeline.campaign import BodySource, Campaign, ImageSource
 from pipeline.campaign_schema import CheckLengthEntry, FixedDatum, ScaleBarEntry, SurveyEntry
+from pipeline.detected_images import load_detections, sizes
+from pipeline.result_sections import survey_notes, survey_section
 from pipeline.runs import Run
 from pipeline.stages.base import Context, Outcome, Stage
-from pipeline.stages.detect import load_detections, sizes
-from robcal.errors import DegenerateGeometry, InvalidInput, NotIdentifiable, RobcalError
+from robcal.errors import InvalidInput, RobcalError, located
 from robcal.files.body_file import BodyFile, write_body
 from robcal.files.camera_file import CameraFile, write_camera
-from robcal.files.measurement_tables import MarksTable
 from robcal.photogrammetry.bundle.colmap_engine import export_colmap
 from robcal.photogrammetry.core.bodies import Body
 from robcal.photogrammetry.core.camera import INTRINSIC_NAMES
 from robcal.photogrammetry.core.network import Lengths
 from robcal.photogrammetry.survey.given_coordinates import GivenCoordinates, compare_given
-from robcal.photogrammetry.survey.survey import BodyTarget, SurveyImage, SurveyResult, survey_body
+from robcal.photogrammetry.survey.survey import SurveyImage, SurveyResult, survey_body
+from robcal.recipe.survey import hardly_seen, marks_by_image, size_of_marks, survey_targets, surveyed_body
 
 NAME = "survey"
 
@@ -37,10 +37,10 @@ def work(context: Context) -> Outcome:
         body = surveyed_body(name, source.file, done, _not_on_it(campaign, run, name, source))
         outputs += [run.save(artifacts.survey(name), done), run.save(artifacts.surveyed_body(name), body)]
         outputs += _write(run, name, source, body, done)
-        notes += [f"survey of '{name}': {note}" for note in _notes(done)]
+        notes += [f"survey of '{name}': {note}" for note in survey_notes(done)]
         doubts = _against_given(campaign, source, done)
         notes += doubts.told(name)
-        results[name] = _result(done) | {"contradictions": doubts.told(name), "mirrored_mm": doubts.mirrored_mm}
+        results[name] = survey_section(done) | {"contradictions": doubts.told(name), "mirrored_mm": doubts.mirrored_mm}
     return Outcome({"survey": results}, outputs, notes)
 
 
@@ -56,19 +56,11 @@ def survey_one(campaign: Campaign, run: Run, name: str, source: BodySource) -> S
         raise InvalidInput(f"{campaign.path}: body '{name}' has no survey")
     check_lengths(campaign, name, entry)
     images, size = _images(run, name, images_of, source.file)
-    targets = [
-        BodyTarget(t.id, t.code, t.diameter, t.xyz, None if t.sigma is None else max(t.sigma))
-        for t in source.file.targets
-    ]
-    listed = {t.id for t in targets}
-    pairs = [*(bar.targets for bar in entry.scale_bars), *(length.targets for length in entry.check_lengths)]
-    stated = {number for pair in pairs for number in pair}
-    targets += [BodyTarget(number, "ring12") for number in sorted(stated - listed)]
     datum = tuple(entry.datum.fixed) if isinstance(entry.datum, FixedDatum) else entry.datum
     try:
         return survey_body(
             images,
-            targets,
+            survey_targets(source.file, entry.ends),
             size=size,
             camera=images_of.start.camera if images_of.start else None,
             scale_bars=lengths(entry.scale_bars),
@@ -99,15 +91,6 @@ def _against_given(campaign: Campaign, source: BodySource, done: SurveyResult) -
             "the left) or these coordinates are (a column with the wrong sign, a left-handed system): correct one"
         )
     return found
-
-
-def located(error: RobcalError, where: str) -> RobcalError:
-    """The same error with the place in front of its message."""
-    if isinstance(error, NotIdentifiable):
-        return NotIdentifiable(f"{where}: {error}", error.parameters)
-    if isinstance(error, InvalidInput):
-        return InvalidInput(f"{where}: {error}")
-    return DegenerateGeometry(f"{where}: {error}") if isinstance(error, DegenerateGeometry) else error
 
 
 def lengths(entries: list[ScaleBarEntry] | list[CheckLengthEntry]) -> Lengths | None:
@@ -144,28 +127,6 @@ def _images(run: Run, name: str, source: ImageSource, file: BodyFile) -> tuple[l
     return [SurveyImage(image, detections=targets) for image, targets in found.items()], sizes(index, key)
 
 
-def marks_by_image(table: MarksTable) -> list[SurveyImage]:
-    """Marks measured by another program, image by image."""
-    rows: dict[str, list[int]] = {}
-    for i, image in enumerate(table.image):
-        rows.setdefault(image, []).append(i)
-    return [
-        SurveyImage(image, marks=(table.target[at], table.xy[at], table.sigma[at][:, None, None] ** 2 * np.eye(2)))
-        for image, at in rows.items()
-    ]
-
-
-def size_of_marks(table: MarksTable) -> tuple[int, int]:
-    """Image size where no file tells it: marks are taken to fill the image evenly on all sides."""
-    low, high = table.xy.min(axis=0), table.xy.max(axis=0)
-    width, height = np.maximum(np.ceil(high + np.maximum(low, 0.0) + 1), 2).astype(int)
-    return int(width), int(height)
-
-
-_MISREAD = 0.2
-"""Share of the usual number of images in which a code may be read that is not there."""
-
-
 def _not_on_it(campaign: Campaign, run: Run, name: str, source: BodySource) -> frozenset[int]:
     """Targets of scale bars that the body file lists without coordinates and that the station (nearly) never sees.
 
@@ -176,8 +137,7 @@ def _not_on_it(campaign: Campaign, run: Run, name: str, source: BodySource) -> f
     entry, station = source.survey_entry, campaign.entry.station
     if entry is None or station is None or station.body != name:
         return frozenset()
-    pairs = [*(bar.targets for bar in entry.scale_bars), *(length.targets for length in entry.check_lengths)]
-    ends = {number for pair in pairs for number in pair}
+    ends = entry.ends
     bare = ends & {t.id for t in source.file.targets if t.id is not None and t.xyz is None}
     seen: Counter[int] = Counter()
     if bare and any(camera.images for camera in campaign.cameras.values()):
@@ -192,39 +152,6 @@ def _not_on_it(campaign: Campaign, run: Run, name: str, source: BodySource) -> f
     return hardly_seen(bare, seen, own)
 
 
-def hardly_seen(targets: Iterable[int], images: Mapping[int, int], own: Sequence[int]) -> frozenset[int]:
-    """Those of some targets that far fewer images (number by id) show than the body's own targets."""
-    usual = float(np.median([images.get(target, 0) for target in own])) if own else 0.0
-    return frozenset(target for target in targets if images.get(target, 0) <= _MISREAD * usual)
-
-
-def surveyed_body(name: str, file: BodyFile, done: SurveyResult, beside: frozenset[int] = frozenset()) -> Body:
-    """The surveyed targets as a body, without those ``beside`` it.
-
-    Targets that the file does not list (those of scale bars) are not on it either.
-    """
-    network = done.network
-    listed = {t.id: t for t in file.targets if t.id is not None and t.id not in beside}
-    unlisted_dot = any(t.id is None for t in file.targets)
-    rows = [i for i, t in enumerate(network.ids) if int(t) in listed or (unlisted_dot and int(t) >= 4096)]
-    at = np.array([3 * i + k for i in rows for k in range(3)], dtype=np.intp)
-    own = [listed.get(int(network.ids[i])) for i in rows]
-    common = next((t.diameter for t in file.targets if t.id is None and t.diameter is not None), np.nan)
-    # what the file does not state was measured, where dots of stated size tell how large dots look
-    measured = np.where(network.radii[rows] > 0, 2.0 * network.radii[rows], np.nan)
-    stated = [common if t is None else np.nan if t.diameter is None else t.diameter for t in own]
-    return Body(
-        name=name,
-        ids=np.array([network.ids[i] for i in rows], dtype=np.int64),
-        points=network.points[rows],
-        covariance=network.points_covariance[np.ix_(at, at)],
-        codes=tuple(t.code if t is not None else None for t in own),
-        diameters=np.where(np.isfinite(stated), stated, measured),
-        polarity=file.polarity,
-        normals=done.normals[rows] if np.isfinite(done.normals[rows]).any() else None,
-    )
-
-
 def _write(run: Run, name: str, source: BodySource, body: Body, done: SurveyResult) -> list[Any]:
     write_body(run.body(name), body, f"surveyed: {done.frame}; {done.scale}", source.file.board)
     sigma = np.sqrt(np.clip(np.diag(done.network.intrinsics_covariance), 0, None))
@@ -236,49 +163,6 @@ def _write(run: Run, name: str, source: BodySource, body: Body, done: SurveyResu
     path = run.camera(f"{NAME}_{name}")
     write_camera(path, camera, f"self-calibrated in the survey of {name}")
     return [run.body(name), path]
-
-
-def _notes(done: SurveyResult) -> list[str]:
-    notes = [*done.notes, *done.network.notes]
-    notes += [f"image {image} not used: {reason}" for image, reason in done.unused_images]
-    if done.unseen_ids:
-        notes.append(f"targets not surveyed: {', '.join(map(str, done.unseen_ids))}")
-    return notes
-
-
-def _result(done: SurveyResult) -> dict[str, Any]:
-    network = done.network
-    checked = network.check_lengths or network.scale_bars
-    return {
-        "images": len(network.image_names),
-        "targets": len(network.ids),
-        "sigma0_px": network.sigma0_px,
-        "rms_px": network.rms_px,
-        "length_error_mm": max((abs(c.error) for c in checked), default=float("nan")) * 1000,
-        "sigma0": network.sigma0,
-        "redundancy": network.redundancy_total,
-        "unknowns": network.unknowns,
-        "rank": network.rank,
-        "datum": network.datum,
-        "condition": network.condition,
-        "correlated": [[c.first, c.second, c.value] for c in network.correlations],
-        "lengths": [
-            {
-                "targets": list(c.ids),
-                "kind": c.kind,
-                "stated_mm": c.expected * 1000,
-                "error_mm": c.error * 1000,
-                "sigma_mm": c.sigma * 1000,
-            }
-            for c in (*network.check_lengths, *network.scale_bars)
-        ],
-        "marks": len(network.marks),
-        "rejected": len(network.rejected),
-        "sigma_mm": float(np.sqrt(np.mean(network.points_sigma**2)) * 1000),
-        "frame": done.frame,
-        "scale": done.scale,
-        "engine": done.engine,
-    }
 
 
 STAGE = Stage(

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import linalg, special
 
+from robcal.calibration.wire import LIMITS as WIRE_LIMITS
 from robcal.errors import InvalidInput, NotIdentifiable
 from robcal.robot.model import ANGLE_OF_AXIS, ELASTIC_KINDS, GEOMETRIC_KINDS, RobotModel
 from robcal.robot.statics import moment_names
@@ -121,7 +122,10 @@ def limit_rules(model: RobotModel, names: Sequence[str]) -> tuple[Array, NDArray
     priors = {f"{t.name}.{short}": 2.0 * sigma for t in model.terms for short, sigma in t.priors.items()}
     for k, name in enumerate(names):
         frame, _, kind = name.rpartition(".")
-        limits[k] = priors.get(name, PLAUSIBLE_START if frame.rpartition(".")[2] in ("base", "tool") else np.inf)
+        end = frame.rpartition(".")[2]
+        limits[k] = priors.get(name, PLAUSIBLE_START if end in ("base", "tool") else np.inf)
+        if end == "wire":
+            limits[k] = WIRE_LIMITS[kind]
         if frame not in frames:
             continue
         if kind in ("x", "y", "z"):

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from robcal import transforms as tf
-from robcal.calibration.pulley import Pulley
+from robcal.calibration.wire import Wire
 from robcal.errors import InvalidInput
 from robcal.photogrammetry.core.camera import Camera, project_with_jacobians
 
@@ -221,12 +221,13 @@ class DistanceObservations(_Rows):
 
     Attributes
     ----------
-    pose : (m,); distance, sigma : (m,) m. pulley : over which the wire leaves, None where it leaves from a point.
+    pose : (m,); distance, sigma : (m,) m. wire : how the count of a wire follows from the distance, None where it is
+        the distance.
     """
 
     distance: Array
     sigma: Array
-    pulley: Pulley | None = None
+    wire: Wire | None = None
     dimension: ClassVar[int] = 1
 
     def __post_init__(self) -> None:
@@ -241,8 +242,8 @@ class DistanceObservations(_Rows):
     def evaluate(self, T: Array) -> tuple[Array, Array]:
         """Distance residual; derivative along the direction to the tool, in tool coordinates."""
         t = T[self.pose, :3, 3]
-        if self.pulley is not None:
-            length, gradient = self.pulley.length(t)
+        if self.wire is not None:
+            length, gradient = self.wire.length(t)
             B = np.zeros((len(t), 1, 6))
             B[:, 0, :3] = np.einsum("mi,mij->mj", gradient, T[self.pose, :3, :3])
             return (self.distance - length)[:, None], B
@@ -376,10 +377,10 @@ class Stack:
         self.used = np.arange(self.depth) < fill[:, None]
         self.rows = int(fill.sum())
 
-    def evaluate(self, T: Array) -> Stacked:
-        """Raw residuals and derivatives by pose."""
+    def evaluate(self, T: Array, observations: Sequence[Observations] | None = None) -> Stacked:
+        """Raw residuals and derivatives by pose; ``observations`` : the same at other values of their parameters."""
         r, B = np.zeros((self.n, self.depth)), np.zeros((self.n, self.depth, 6))
-        for o, (pose, slot) in zip(self.observations, self.slots, strict=True):
+        for o, (pose, slot) in zip(observations or self.observations, self.slots, strict=True):
             r_o, B_o = o.evaluate(T)
             r[pose[:, None], slot] = r_o
             B[pose[:, None], slot] = B_o

@@ -49,6 +49,8 @@ class CameraEntry(Entry):
     k3: Number = 0.0
     pixel_um: Positive | None = None
     world_T_camera: Placement | None = None
+    flange_T_camera: Placement | None = None
+    base_T_camera: Placement | None = None
     sigmas: dict[str, Number] = Field(default_factory=dict)
 
 
@@ -61,12 +63,15 @@ class CameraFile:
     world_T_camera : (4, 4) where the camera stands, if the file says so.
     pixel_um : size of a pixel, for reports only.
     sigmas : standard deviations of the interior orientation by name, where known.
+    flange_T_camera, base_T_camera : (4, 4) of a camera in the hand of a robot, or beside it.
     """
 
     camera: Camera
     world_T_camera: Array | None = None
     pixel_um: float | None = None
     sigmas: dict[str, float] | None = None
+    flange_T_camera: Array | None = None
+    base_T_camera: Array | None = None
 
 
 def read_camera(path: Path | str) -> CameraFile:
@@ -89,6 +94,8 @@ def read_camera(path: Path | str) -> CameraFile:
         world_T_camera=entry.world_T_camera.matrix() if entry.world_T_camera else None,
         pixel_um=entry.pixel_um,
         sigmas=dict(entry.sigmas) or None,
+        flange_T_camera=entry.flange_T_camera.matrix() if entry.flange_T_camera else None,
+        base_T_camera=entry.base_T_camera.matrix() if entry.base_T_camera else None,
     )
 
 
@@ -122,8 +129,10 @@ def write_camera(path: Path | str, content: CameraFile, comment: str = "") -> No
     data.update({name: float(getattr(camera, name)) for name in INTRINSIC_NAMES})
     if content.pixel_um is not None:
         data["pixel_um"] = float(content.pixel_um)
-    if content.world_T_camera is not None:
-        data["world_T_camera"] = placement_data(content.world_T_camera)
+    for name in ("world_T_camera", "flange_T_camera", "base_T_camera"):
+        placed = getattr(content, name)
+        if placed is not None:
+            data[name] = placement_data(placed)
     if content.sigmas:
         data["sigmas"] = FlowMapping({name: float(value) for name, value in content.sigmas.items()})
     write_text(Path(path), yaml_text(data, comment))

@@ -100,6 +100,23 @@ def _read_dh(file: Path) -> RobotModel:
 
 
 def _read_ur(file: Path, kinematics: Mapping[str, Any]) -> RobotModel:
+    return model_from_steps(file.stem, _ur_steps(file, kinematics))
+
+
+def read_ur_joints(path: Path) -> list[UrdfStep]:
+    """The six joints of Universal Robots' factory calibration.
+
+    Raises
+    ------
+    InvalidInput : the file holds none.
+    """
+    kinematics = read_yaml(path).data.get("kinematics")
+    if not isinstance(kinematics, Mapping):
+        raise InvalidInput(f"{path}: holds no 'kinematics': name the kinematics.yaml that the robot was read from")
+    return _ur_steps(path, kinematics)
+
+
+def _ur_steps(file: Path, kinematics: Mapping[str, Any]) -> list[UrdfStep]:
     steps = []
     for link, joint in _UR_JOINTS.items():
         entry = kinematics.get(link)
@@ -109,4 +126,4 @@ def _read_ur(file: Path, kinematics: Mapping[str, Any]) -> RobotModel:
             raise InvalidInput(f"{file}: kinematics.{link} must give x, y, z (m) and roll, pitch, yaw (rad)")
         origin = frame_from_xyzrpy([float(v) for v in numbers])
         steps.append(UrdfStep(joint, "revolute", origin, np.array([0.0, 0.0, 1.0]), None, 0.0, np.zeros(3), link))
-    return model_from_steps(file.stem, steps)
+    return steps

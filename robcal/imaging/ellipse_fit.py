@@ -27,6 +27,7 @@ _LN_BLUR_SIGMA = 1.0  # weak prior on ln s: keeps dots of two pixels from an edg
 _OUTLIER_SIGMA = 6.0
 _SHADING_SIGMA_MIN = 1e-3  # per radius; keeps the prior finite
 _SINGULAR = 1e-7  # smallest eigenvalue of a scaled normal matrix summed in single precision
+_LN_S_MIN = float(np.log(0.28))
 _COST_DIGITS = 2e-6  # relative accuracy of a cost summed in single precision
 
 
@@ -122,59 +123,6 @@ def start(shape: Array, base: Array, peak: Array, windows: Windows, is_spot: NDA
     )
 
 
-@dataclass(frozen=True)
-class _System(Columns):
-    normal: Array
-    right: Array
-    cost: Array
-    residual: Array
-
-
-def _system(
-    parameters: Array,
-    prior_blur: Array,
-    windows: Windows,
-    is_spot: NDArray[np.bool_],
-    shading_sigma: Array,
-    precision: Array,
-    buffers: tuple[Array, Array],
-) -> _System:
-    """Normal equations with priors at the given parameters.
-
-    `precision` (n, p) of the pixels, 0 if left out; `buffers` two arrays (>= n, 13, p) for the derivatives.
-    """
-    n = len(parameters)
-    columns, weighted = (buffer[:n] for buffer in buffers)
-    # a step into nowhere exceeds single precision; it is not taken, its cost is no number
-    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        model, _ = evaluate(parameters, windows, is_spot, columns)
-        residual = np.subtract(windows.value, model, out=columns[:, PARAMETERS])
-        np.multiply(columns, _weight(precision, windows, residual)[:, None], out=weighted)
-        products = np.matmul(weighted, columns.transpose(0, 2, 1)).astype(np.float64)
-    normal = 0.5 * (products[:, :PARAMETERS, :PARAMETERS] + products[:, :PARAMETERS, :PARAMETERS].transpose(0, 2, 1))
-    right, cost = products[:, :PARAMETERS, PARAMETERS].copy(), products[:, PARAMETERS, PARAMETERS].copy()
-    # priors
-    blur_precision = 1.0 / _LN_BLUR_SIGMA**2
-    offset = prior_blur - parameters[:, 5]
-    normal[:, 5, 5] += blur_precision
-    right[:, 5] += blur_precision * offset
-    cost += blur_precision * offset**2
-    contrast = np.abs(parameters[:, 9])
-    sigma = np.maximum(shading_sigma, _SHADING_SIGMA_MIN) * np.maximum(contrast, 1e-3)
-    for k in (10, 11):
-        normal[:, k, k] += 1.0 / sigma**2
-        right[:, k] -= parameters[:, k] / sigma**2
-        cost += (parameters[:, k] / sigma) ** 2
-    # a contrast that only censored pixels know stays finite
-    normal[:, 9, 9] += 1e-4 / np.maximum(contrast, 1.0) ** 2
-    return _System(normal, right, cost, residual.copy())
-
-
-def _weight(precision: Array, windows: Windows, residual: Array) -> Array:
-    """Precision (n, p) without censored pixels: a saturated pixel above whose level the model is fits."""
-    return np.where(windows.saturated & (residual < 0), np.float32(0.0), precision) if windows.censored else precision
-
-
 def iterate(
     fits: EllipseFits,
     windows: Windows,
@@ -194,78 +142,42 @@ def iterate(
     n = len(fits.parameters)
     if n == 0:
         return fits
+    from robcal.imaging.ellipse_loop import Dots, Fits, minimise_all  # compiled: imported where it runs
+
     used = windows.valid if dropped is None else windows.valid & ~dropped
-    prior = fits.parameters[:, 5].copy() if prior_blur is None else prior_blur
-    parameters, is_spot, shading = fits.parameters.copy(), fits.is_spot, fits.shading_sigma
-    # weights from the model at the start of the call: within one call the cost is one function
-    model = grey_values(parameters, windows, is_spot)
-    precision = (used / noise.at(model)).astype(model.dtype, copy=False)
-    size = (n, PARAMETERS + 1, windows.x.shape[1])
-    buffers = (np.empty(size, precision.dtype), np.empty(size, precision.dtype))
-    best = _system(parameters, prior, windows, is_spot, shading, precision, buffers)
-    pixels = np.maximum(used.sum(axis=1), 1)
-    damping = np.full(n, 1e-4)
-    converged = np.zeros(n, bool)
-    active = np.arange(n)
-    sub, sub_precision = windows, precision
-    for _ in range(steps):
-        now = parameters[active]
-        step = _limited(
-            _solve(best.normal[active], best.right[active], damping[active], is_spot[active]),
-            now,
-            windows.radius[active],
-        )
-        trial = now + step
-        trial[:, 5] = np.clip(trial[:, 5], np.log(0.28), np.log(np.maximum(windows.radius[active], 1.0) * 2.0))
-        definite = (trial[:, 2] * trial[:, 4] > trial[:, 3] ** 2) & (trial[:, 2] > 0) & np.isfinite(trial).all(axis=1)
-        trial[~definite] = now[~definite]
-        new = _system(trial, prior[active], sub, is_spot[active], shading[active], sub_precision, buffers)
-        better = definite & (new.cost <= best.cost[active] * (1.0 + _COST_DIGITS) + 1e-9)
-        # N step squared is the move in units of sigma
-        move = np.einsum("ni,nij,nj->n", step, best.normal[active], step)
-        # of misfit as large as k sigma the minimum need not be known better than k sigma
-        move /= np.maximum(1.0, best.cost[active] / pixels[active])
-        accepted = active[better]
-        parameters[accepted] = trial[better]
-        best.put(accepted, new, better)
-        damping[accepted] *= 0.1
-        damping[active[~better]] = np.maximum(damping[active[~better]] * 20.0, 1e-3)
-        done = (move < tolerance**2) | (~better & (damping[active] > 1e4))
-        converged[active[done]] = True
-        if done.any():
-            left = np.flatnonzero(~done)
-            active = active[left]
-            if active.size == 0:
-                break
-            sub, sub_precision = sub.select(left), sub_precision[left]
-    return replace(
-        fits,
-        parameters=parameters,
-        normal=best.normal,
-        cost=best.cost,
-        converged=converged,
-        weight=_weight(precision, windows, best.residual),
-        residual=best.residual,
+    dots = Dots(
+        np.stack([windows.x, windows.y, windows.u, windows.v, windows.value]),
+        used,
+        windows.saturated,
+        _last(used),
+        fits.is_spot,
+        np.stack(
+            [
+                fits.parameters[:, 5] if prior_blur is None else prior_blur,
+                np.full(n, 1.0 / _LN_BLUR_SIGMA**2),
+                np.maximum(fits.shading_sigma, _SHADING_SIGMA_MIN),
+                windows.radius,
+                np.maximum(used.sum(axis=1), 1),
+            ],
+            axis=1,
+        ),
     )
+    ended = Fits(
+        fits.parameters.copy(),
+        np.empty((n, PARAMETERS, PARAMETERS)),
+        np.empty(n),
+        np.zeros(n, bool),
+        np.zeros_like(windows.x),
+        np.zeros_like(windows.x),
+    )
+    noise_model = np.array([noise.variance, noise.gain, noise.level, noise.step**2 / 12.0])
+    minimise_all(dots, noise_model, np.array([steps, tolerance, _COST_DIGITS, _LN_S_MIN]), ended)
+    return replace(fits, **ended._asdict())
 
 
-def _limited(step: Array, parameters: Array, radius: Array) -> Array:
-    """Steps (n, 12) never larger than a part of the dot."""
-    factor = np.minimum(1.0, 0.3 * (radius + 1.0) / np.maximum(np.hypot(step[:, 0], step[:, 1]), 1e-12))
-    factor = np.minimum(factor, 0.7 / np.maximum(np.abs(step[:, 5]), 1e-12))
-    b_norm = np.abs(parameters[:, 2]) + np.abs(parameters[:, 4])
-    factor = np.minimum(factor, 0.4 * b_norm / np.maximum(np.abs(step[:, 2:5]).sum(axis=1), 1e-12))
-    return step * factor[:, None]
-
-
-def _solve(normal: Array, right: Array, damping: Array, is_spot: NDArray[np.bool_]) -> Array:
-    diagonal = np.maximum(np.diagonal(normal, axis1=1, axis2=2), 1e-300)
-    scale = 1.0 / np.sqrt(diagonal)
-    scaled = normal * scale[:, :, None] * scale[:, None, :]
-    scaled[:, np.arange(PARAMETERS), np.arange(PARAMETERS)] = 1.0 + np.maximum(damping, 1e-10)[:, None]
-    step = np.linalg.solve(scaled, (right * scale)[..., None])[..., 0] * scale
-    step[is_spot, 5] = 0.0
-    return step
+def _last(used: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """(n,) pixels of each row up to the last one used."""
+    return np.asarray(used.shape[1] - np.argmax(used[:, ::-1], axis=1))
 
 
 def free_shading(fits: EllipseFits) -> tuple[Array, Array]:

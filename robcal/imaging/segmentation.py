@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from robcal.imaging.blobs import Candidates, judge, rough_sigma
+from robcal.imaging.blobs import Candidates
 from robcal.imaging.detections import Reason, RejectionLog
 from robcal.imaging.noise import NoiseModel
 from robcal.imaging.settings import DetectionSettings
@@ -25,13 +25,19 @@ _MAX_NODES = 5000  # thresholds tried in one image; a photograph of something el
 _MAX_PARTS = 3000  # connected parts above the background, holes included; beyond, the threshold is raised
 _MAX_LARGE = 40  # large parts that are searched with a finer background
 _MAX_DEPTH = 7
-_CROSS = np.ones((5, 5), np.uint8)
 _NEIGHBOURS = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], np.uint8)
 _BAND = 32  # rows
 _TURN = np.arange(16) * (np.pi / 8.0)
 _AROUND = 4  # px from the middle of the smallest parts to what is taken for their background
-_MANY = 8  # parts of a node from which it pays to examine the smallest together
 _PEAK_BY_CONTRAST = 0.6  # of a spot in the corner of a pixel
+_REASONS = (
+    Reason.CONTRAST,
+    Reason.TOO_LARGE,
+    Reason.TOO_SMALL,
+    Reason.ELONGATED,
+    Reason.SHAPE,
+    Reason.BORDER,
+)  # by the numbers of blob_tree
 
 
 @dataclass(frozen=True)
@@ -74,18 +80,52 @@ def find_candidates(image: NDArray, noise: NoiseModel, settings: DetectionSettin
     for node in nodes[:_MAX_LARGE]:
         if max(node.mask.shape) > 2.2 * settings.max_axis_px + 2.0:
             nodes += _finer_nodes(node, image, settings.max_axis_px / 4.0, noise, settings, log)
-    found: list[tuple[float, ...]] = []
-    visited = 0
-    while nodes and visited < _MAX_NODES:
-        visited += 1
-        _split(nodes.pop(), image, noise, settings, nodes, found, log)
-    rows = _distinct(image, np.array(found, dtype=float).reshape(-1, 8))
+    found, left = _cut(image, nodes, noise, settings, log)
+    rows = _distinct(image, found)
     if len(rows) > settings.max_candidates:
         order = np.argsort(-(rows[:, 6] - rows[:, 5]))
         log.count(Reason.OVER_CAP, len(rows) - settings.max_candidates)
         rows = rows[order[: settings.max_candidates]]
-    log.count(Reason.OVER_CAP, len(nodes))
-    return Candidates(rows[:, :2], rows[:, 2:4], rows[:, 4], rows[:, 5], rows[:, 6], rows[:, 7], bool(nodes))
+    log.count(Reason.OVER_CAP, left)
+    return Candidates(rows[:, :2], rows[:, 2:4], rows[:, 4], rows[:, 5], rows[:, 6], rows[:, 7], bool(left))
+
+
+def _cut(
+    image: NDArray, nodes: Sequence[_Node], noise: NoiseModel, settings: DetectionSettings, log: RejectionLog
+) -> tuple[Array, int]:
+    """Blobs (f, 8) of all nodes, each cut half way between its base and its peak, and its parts again; nodes left."""
+    from robcal.imaging import blob_tree  # compiled: imported where it runs
+
+    if not nodes:
+        return np.zeros((0, 8)), 0
+    height, width = image.shape
+    pixels = []
+    for node in nodes:
+        rows, columns = np.nonzero(node.mask)
+        pixels.append(((rows + node.y) * width + columns + node.x).astype(np.int32))
+    pool, number = np.concatenate(pixels), len(nodes)
+    parts = np.zeros((number + len(pool) // 4 + 1, 3))
+    parts[:number, 0] = [len(some) for some in pixels]
+    parts[:number, 1] = [node.base for node in nodes]
+    parts[:number, 2] = [node.depth for node in nodes]
+    stack = blob_tree.Stack(pool, parts, np.array([number, len(pool)]))
+    seen = blob_tree.Image(
+        np.ascontiguousarray(image).ravel(),
+        np.zeros(image.size, np.int32),
+        height,
+        width,
+        np.array([noise.variance, noise.gain, noise.level, noise.step**2 / 12.0]),
+        np.array([settings.min_axis_px, settings.max_axis_px, settings.min_axis_ratio, settings.min_contrast_sigma]),
+    )
+    refused = blob_tree.Refused(np.empty((log.keep, 4)), np.zeros(len(_REASONS), np.int64), np.zeros(1, np.int64))
+    found = blob_tree.cut_parts(seen, stack, refused, _MAX_NODES, _MAX_DEPTH)
+    places = refused.places[: int(refused.used[0])]
+    for x, y, size, reason in places.tolist():
+        log.add(x, y, size, _REASONS[int(reason)])
+    more = refused.tally - np.bincount(places[:, 3].astype(int), minlength=len(_REASONS))
+    for reason, count in zip(_REASONS, more.tolist(), strict=True):
+        log.count(reason, count)
+    return found, int(stack.used[0])
 
 
 def _nodes_above_background(
@@ -252,94 +292,3 @@ def _first_nodes(above: NDArray, background: NDArray, offset: float, boxes: NDAr
         base = float(background[y + height // 2, x + width // 2]) + offset
         nodes.append(_Node(x, y, part, base, 0))
     return nodes
-
-
-def _split(
-    node: _Node,
-    image: NDArray,
-    noise: NoiseModel,
-    settings: DetectionSettings,
-    nodes: list[_Node],
-    found: list[tuple[float, ...]],
-    log: RejectionLog,
-) -> None:
-    """Cuts one node half way between its base and its peak; dots go to `found`, the rest is cut again or refused."""
-    height, width = node.mask.shape
-    crop = image[node.y : node.y + height, node.x : node.x + width]
-    size, peak = _size_and_peak(crop, node.mask)
-    if size < 2:
-        return
-    sigma = max(float(np.sqrt(noise.at(node.base))), rough_sigma(crop, node.mask) if size > 200 else 0.0)
-    if peak - node.base < 0.6 * settings.min_contrast_sigma * sigma:
-        if node.depth == 0:
-            log.add(node.x + width / 2, node.y + height / 2, max(width, height) / 2, Reason.CONTRAST)
-        return
-    level = 0.5 * (node.base + peak)
-    core = ((crop > int(level)) & (node.mask > 0)).view(np.uint8)
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(core, connectivity=4, ltype=cv2.CV_32S)
-    for part in _worth_a_look(stats, node, image, sigma, noise, settings).tolist():
-        left, upper, w, h, area = stats[part].tolist()
-        box = (slice(upper, upper + h), slice(left, left + w))
-        mask = (labels[box] == part).view(np.uint8)
-        x, y = node.x + left, node.y + upper
-        values = crop[box][mask > 0]
-        part_peak = float(values.max())
-        # crumbs of noise along the level's contour on a slope
-        if part_peak - level < 0.3 * settings.min_contrast_sigma * sigma:
-            continue
-        reason = judge(mask, crop[box], area, level, node.base, (x, y), image.shape, settings, found)
-        if reason is None:
-            continue
-        # an evenly bright part has no dots of its own inside
-        even = float(values.mean()) - level > 0.5 * (part_peak - level)
-        if (
-            node.depth < _MAX_DEPTH
-            and area > 12
-            and (not even or reason is Reason.TOO_LARGE)
-            and part_peak - level > (settings.min_contrast_sigma * sigma)
-        ):
-            nodes.append(_Node(x, y, mask, level, node.depth + 1))
-            if reason is not Reason.TOO_LARGE:
-                continue
-        log.add(x + w / 2, y + h / 2, max(w, h) / 2, reason)
-    # fainter parts of the node that hang together with a brighter one only by its glare
-    if node.depth < _MAX_DEPTH and size > 1.5 * np.count_nonzero(core) + 8:
-        rest = np.where(cv2.dilate(core, _CROSS) > 0, 0, node.mask).astype(np.uint8)
-        if np.count_nonzero(rest) >= 6:
-            _add_rest(rest, node, crop, settings.min_contrast_sigma * sigma, nodes)
-
-
-def _size_and_peak(crop: NDArray, mask: NDArray[np.uint8]) -> tuple[int, float]:
-    """Number of pixels of a part, and a high but not the highest value of them: one hot pixel is no peak."""
-    if crop.dtype == np.uint8 and crop.size > 5000:
-        above = np.cumsum(cv2.calcHist([crop], [0], mask, [256], [0, 256]).ravel()[::-1].astype(np.int64))
-        return int(above[-1]), float(255 - np.searchsorted(above, min(3, int(above[-1]) // 6) + 1))
-    inside = crop[mask > 0]
-    if inside.size < 12:
-        at = min(inside.size // 6, 3)
-        return inside.size, float(np.sort(inside)[-1 - at]) if inside.size else 0.0
-    at = inside.size - 1 - min(3, inside.size // 6)
-    return inside.size, float(np.partition(inside, at)[at])
-
-
-def _worth_a_look(
-    stats: NDArray, node: _Node, image: NDArray, sigma: float, noise: NoiseModel, settings: DetectionSettings
-) -> NDArray[np.int64]:
-    """Labels of the parts of a node that are more than a pixel, and where there are many, more than noise."""
-    parts = np.arange(1, len(stats))[stats[1:, cv2.CC_STAT_AREA] > 1]
-    if len(parts) < _MANY:
-        return parts
-    boxes = stats[parts, :4].astype(np.int64)
-    boxes[:, :2] += (node.x, node.y)
-    return parts[_stand_out(image, boxes, sigma, noise, settings)]
-
-
-def _add_rest(rest: NDArray[np.uint8], node: _Node, crop: NDArray, lift: float, nodes: list[_Node]) -> None:
-    """Adds the connected parts of the rest that have a peak of their own."""
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(rest, connectivity=4, ltype=cv2.CV_32S)
-    for part in (1 + np.flatnonzero(stats[1:, cv2.CC_STAT_AREA] >= 4)).tolist():
-        left, upper, w, h, _ = stats[part].tolist()
-        box = (slice(upper, upper + h), slice(left, left + w))
-        mask = (labels[box] == part).view(np.uint8)
-        if float(crop[box][mask > 0].max()) - node.base > lift:
-            nodes.append(_Node(node.x + left, node.y + upper, mask, node.base, node.depth + 1))

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from robcal.calibration.wire import Wire
 from robcal.cause import Cause, Kind, describe
 from robcal.robot.terms import evaluate, identifier
 
@@ -69,7 +70,7 @@ class ObservationData:
     world_T_tool : (m, 4, 4) modelled frame of the tool at each observation.
     p_tool : (m, 3) modelled coordinates of the target in the tool (zeros for frames).
     p_world : (m, 3) modelled position in the measuring system.
-    p_sensor : (m, 3) measured coordinates in the sensor, if there is one.
+    p_sensor : (m, 3) measured coordinates in the sensor, if there is one. wire : of distances, how they are counted.
     variables : per pose, the covariates (time_s, temp_*, index ...) and the kernel's variables, each (n,).
     """
 
@@ -81,6 +82,7 @@ class ObservationData:
     p_world: Array
     p_sensor: Array | None
     variables: Mapping[str, Array]
+    wire: Wire = field(default_factory=Wire)
 
 
 @dataclass(frozen=True)

@@ -47,9 +47,6 @@ SPHERE_GROWTH = Kind(
     "The calibration sphere grows by {um_per_m_K:.1f} um per metre and kelvin",
 )
 
-STEEL_WIRE_N = 5.0
-"""Tension that a draw-wire encoder typically keeps up (makers' data sheets: 2 to 10 N); sag scales with its inverse."""
-GRAVITY = 9.80665
 Course = Callable[[ObservationData], Array]
 
 
@@ -60,7 +57,7 @@ def measuring_causes(data: ObservationData, ids: tuple[int, ...], body: str) -> 
     if data.kind == "points":
         yield from _body(data, ids, body)
     if data.kind == "distances":
-        yield from _wire()
+        yield from _wire(data)
     if data.kind == "sensor":
         yield from _sensor(data, body)
 
@@ -241,45 +238,36 @@ def swapped(data: ObservationData, i: int, j: int) -> ObservationCause:
     )
 
 
-def _wire() -> Iterator[ObservationCause]:
-    def length(d: ObservationData) -> Array:
-        return np.linalg.norm(d.p_world, axis=1)
+def _wire(data: ObservationData) -> Iterator[ObservationCause]:
+    stated = data.wire
 
-    def cause(kind: Kind, prior: float, name: str, factor: float, law: Course) -> ObservationCause:
+    def cause(kind: Kind, prior: float, parameter: str, report: str, factor: float) -> ObservationCause:
+        def law(d: ObservationData, c: Constants) -> Array:
+            return d.wire.by_parameter(d.p_world, (parameter,))[:, None, :]
+
         return ObservationCause(
             kind,
             "wire",
             None,
-            ("amount",),
+            (parameter,),
             (prior,),
-            lambda v, c: {name: float(v[0]) * factor},
-            observation_shift=lambda d, c: law(d)[:, None, None],
+            lambda v, c: {report: (float(v[0]) + getattr(stated, parameter)) * factor},
+            observation_shift=law,
         )
-
-    def sag(d: ObservationData) -> Array:
-        # parabola: arc - chord = (w L cos)^2 L / (24 H^2), linear in the square of the weight per length
-        horizontal = np.hypot(d.p_world[:, 0], d.p_world[:, 1])
-        return (GRAVITY / STEEL_WIRE_N) ** 2 * horizontal**2 * length(d) / 24.0
 
     yield replace(
         # 4.5 g/m: a steel wire of 0.9 mm; what matters is the ratio to the tension, which varies as much
-        cause(WIRE_SAG, 2e-5, "g_per_m", 1.0, sag),
-        report=lambda v, c: {"g_per_m": float(np.sqrt(max(v[0], 0.0))) * 1e3},
+        cause(WIRE_SAG, 2e-5, "sag", "g_per_m", 1.0),
+        report=lambda v, c: {"g_per_m": float(np.sqrt(max(v[0] + stated.sag, 0.0))) * 1e3},
         positive=0.99,
-        limits=(0.0, np.inf),
+        limits=(-stated.sag, np.inf),
     )
-    yield cause(WIRE_STRETCH, 1e-4, "ppm_per_m", 1e6, lambda d: length(d) ** 2)
-    yield cause(WIRE_SCALE, 3e-4, "ppm", 1e6, length)
-    yield cause(WIRE_OFFSET, 1e-3, "mm", 1e3, lambda d: np.ones(len(d.pose)))
+    yield cause(WIRE_STRETCH, 1e-4, "stretch", "ppm_per_m", 1e6)
+    yield cause(WIRE_SCALE, 3e-4, "scale", "ppm", 1e6)
+    yield cause(WIRE_OFFSET, 1e-3, "offset", "mm", 1e3)
     # over the top of the pulley: the higher the wire leaves, the less of it is wrapped
-    wrap = cause(
-        PULLEY_WRAP,
-        5e-3,
-        "radius_mm",
-        1e3,
-        lambda d: -np.arctan2(d.p_world[:, 2], np.hypot(d.p_world[:, 0], d.p_world[:, 1])),
-    )
-    yield replace(wrap, positive=0.99, limits=(0.0, 0.5))
+    wrap = cause(PULLEY_WRAP, 5e-3, "radius", "radius_mm", 1e3)
+    yield replace(wrap, positive=0.5 if stated.radius else 0.99, limits=(-stated.radius, 0.5))
 
 
 def _sensor(data: ObservationData, body: str) -> Iterator[ObservationCause]:

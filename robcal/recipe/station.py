@@ -9,6 +9,8 @@ from robcal.diagnosis.images.camera_moves import which_moved, with_small_moves
 from robcal.diagnosis.images.diagnosis import ImageFinding
 from robcal.diagnosis.images.light_lag import with_dot_sizes, without_lag
 from robcal.diagnosis.images.station import station_data
+from robcal.errors import InvalidInput
+from robcal.files.measurement_tables import MarksTable
 from robcal.photogrammetry.core.bodies import Body
 from robcal.photogrammetry.core.camera import Camera
 from robcal.photogrammetry.station.network import StationMarks, StationOrientation, StationSettings
@@ -93,6 +95,21 @@ def orient_images(images: StationImages, diagnose: bool, misfit_of: Misfit | Non
     if misfit_of is not None:
         found = which_moved(found, again, lambda tried: misfit_of(tried, marks))
     return OrientedStation(found, marks, (*corrected, *lags))
+
+
+def marks_of_table(table: MarksTable, body: Body, place: Mapping[str, int]) -> StationMarks:
+    """Marks of another program: those of targets of the body; ``place`` are the pose numbers by image.
+
+    Raises
+    ------
+    InvalidInput : none of its targets is on the body.
+    """
+    listed = body.index(table.target) >= 0
+    if not listed.any():
+        raise InvalidInput(f"{table.path}: none of its targets is on body '{body.name}': check the ids")
+    covariance = table.sigma[listed][:, None, None] ** 2 * np.eye(2)
+    pose = np.array([place[image] for image in table.image], dtype=np.int64)
+    return StationMarks(pose[listed], table.target[listed], table.xy[listed], covariance)
 
 
 def light_of(

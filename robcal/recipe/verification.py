@@ -208,3 +208,17 @@ def tool_miss(robot: IdentifiedRobot, inputs: PoseInputs, recording: RobotRecord
         row = int(rows[pose])
         out[row] = max(out.get(row, 0.0), float(miss))
     return out
+
+
+PAYS = 0.95
+"""Share of the error that has to be left for approach directions to be worth stating."""
+
+
+def approach_note(found: RobotVerification) -> list[str]:
+    """What stating approach directions would gain."""
+    if found.unstated is None or found.recorded is None:
+        return []
+    before, after = (1e3 * v.tools["0"].rms for v in (found.unstated, found.recorded))
+    if after > PAYS * before:
+        return []
+    return [f"state approach: {before:.3f} -> {after:.3f} mm RMS at the kept-out poses"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import ctypes
+import json
 import re
 import shutil
 import subprocess
@@ -15,7 +16,7 @@ import pytest
 
 from fixtures.campaigns import make_campaign
 from pipeline.artifacts import IDENTIFICATION
-from pipeline.exports import export_run
+from pipeline.exports import Wanted, export_run
 from pipeline.prediction import CompensateOptions, compensate_run, predict_run
 from pipeline.runner import run_campaign
 from pipeline.runs import open_run
@@ -56,7 +57,7 @@ def finished(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFa
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="needs gcc")
 def test_compiled_forward_model_says_what_predict_says(finished: tuple[Path, Path], tmp_path: Path) -> None:
     campaign, run = finished
-    written = export_run(run, tmp_path, tmp_path / "robot.urdf")
+    written, _ = export_run(run, Wanted(c=tmp_path, urdf=tmp_path / "robot.urdf"))
     source = next(p for p in written if p.suffix == ".c")
     header = source.with_suffix(".h").read_text()
     flags = ["-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-O1", "-shared", "-fPIC"]
@@ -123,3 +124,16 @@ def test_targets_of_programs_are_base_coordinates_whatever_the_frames_were_given
     poses = [line for line in out.read_text().splitlines() if "movej(p[" in line]
     places = np.array([[float(v) for v in line.split("p[")[1].split("]")[0].split(",")][:3] for line in poses])
     assert places == pytest.approx(believed[1:, :3, 3], abs=1e-6)
+
+
+def test_parameters_leave_as_plain_data(finished: tuple[Path, Path], tmp_path: Path) -> None:
+    _, run = finished
+    robot = load_calibrated(open_run(run))
+    export_run(run, Wanted(data=tmp_path / "data"))
+    data = json.loads((tmp_path / "data" / "robot.json").read_text())
+    table = read_table(tmp_path / "data" / "parameters.csv")
+    values = dict(zip(table.texts("parameter"), table.numbers("value"), strict=True))
+    for name, value in robot.values.items():
+        if not name.startswith(("base.", "tool.")):
+            assert values[name] == data["parameters"][name]["value"] == pytest.approx(value)
+    assert data["covariance"]["names"] == list(robot.names)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,7 +23,7 @@ TURNS = [f"{end}.{kind}" for end in ("world_T_base", "flange_T_tool") for kind i
 
 
 @pytest.fixture(scope="module")
-def wires_and_tracker(tmp_path_factory):  # type: ignore[no-untyped-def]
+def wires_and_tracker(tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, Path]:
     """Two wires identify, a tracker verifies."""
     folder = tmp_path_factory.mktemp("wires")
     wire = Watcher("distances", poses="identify", sigma_mm=0.02)
@@ -32,7 +33,7 @@ def wires_and_tracker(tmp_path_factory):  # type: ignore[no-untyped-def]
     return made, folder
 
 
-def test_lengths_identify_and_frames_verify(wires_and_tracker) -> None:  # type: ignore[no-untyped-def]
+def test_lengths_identify_and_frames_verify(wires_and_tracker: tuple[Any, Path]) -> None:
     _, folder = wires_and_tracker
     result = json.loads((folder / "run" / "result.json").read_text())
     wire, tracker = result["instruments"]["left"], result["instruments"]["tracker"]
@@ -44,7 +45,7 @@ def test_lengths_identify_and_frames_verify(wires_and_tracker) -> None:  # type:
     assert tracker["verification"]["nominal"]["0"]["mean"] > 2.0
 
 
-def test_predictions_are_made_in_the_world_of_the_named_instrument(wires_and_tracker) -> None:  # type: ignore[no-untyped-def]
+def test_predictions_are_made_in_the_world_of_the_named_instrument(wires_and_tracker: tuple[Any, Path]) -> None:
     made, folder = wires_and_tracker
     poses, out = folder / "campaign" / "poses.csv", folder / "f.csv"
     predict_run(folder / "run", poses, out)
@@ -115,17 +116,70 @@ def test_an_instrument_whose_rows_share_no_pose_with_the_joint_angles_is_named(t
         read_campaign(folder)
 
 
-@pytest.mark.parametrize("modelled", [True, False])
-def test_a_pulley_in_the_model_gives_the_right_robot_and_one_left_out_an_alarm(tmp_path: Path, modelled: bool) -> None:
+CORRECTION = """
+import math
+
+def straight(length, direction):
+    # the count of a wheel of 40 mm, on which the distance is found by Newton's method
+    r, e = 40.0, math.asin(direction[2])
+    d = length
+    for _ in range(5):
+        counted = math.sqrt(d * d - r * r) + r * (math.asin(r / d) - e)
+        d -= (counted - length) / (math.sqrt(d * d - r * r) / d)
+    return d
+"""
+
+
+@pytest.mark.parametrize("way", ["free", "corrected", "left out"])
+def test_a_pulley_in_the_model_gives_the_right_robot_and_one_left_out_an_alarm(tmp_path: Path, way: str) -> None:
     wrap = Effect("pulley_wrap", "wire", parameters={"radius_mm": 40.0})
     wire = Watcher("distances", poses="identify", sigma_mm=0.02, effects=(wrap,))
     model = ("axis2.pitch", "axis2.x", "axis3.pitch", "axis3.x", "axis5.pitch")
-    plan = Plan(seed=3, poses=80, verify=10, model=model, kept_out=2, compliance=False)
+    plan = Plan(seed=3, poses=50, verify=10, model=model, kept_out=2, compliance=False)
     made = watch(plan, {"tracker": Watcher(poses="verify"), "wire": wire})
-    pulley = {"pulley": {"radius_mm": 40.0, "axis": [0, 0, 1]}} if modelled else {}
-    write_watched(tmp_path / "campaign", made, {"wire": pulley})
+    entry = {
+        "free": {"pulley": {"radius_mm": 25.0, "axis": [0, 0, 1], "free": "radius"}},
+        "corrected": {"correction": "wheel:straight"},
+        "left out": {},
+    }[way]
+    write_watched(tmp_path / "campaign", made, {"wire": entry}, diagnosis={"enabled": False})
+    (tmp_path / "campaign" / "wheel.py").write_text(CORRECTION)
     run_campaign(tmp_path / "campaign", out=tmp_path / "run", until="verify")
-    error = json.loads((tmp_path / "run" / "result.json").read_text())["verification"]["tools"]["0"]["mean"]
+    result = json.loads((tmp_path / "run" / "result.json").read_text())
+    error = result["verification"]["tools"]["0"]["mean"]
     log = (tmp_path / "run" / "log.txt").read_text()
-    assert (error < 0.12) == modelled
-    assert modelled or "verify in 6D before driving" in log
+    assert (error < 0.12) == (way != "left out")
+    assert way != "left out" or "verify in 6D before driving" in log
+    assert ("corrected from outside in" in log) == (way == "corrected")
+    if way == "free":
+        radius = result["instruments"]["wire"]["wire"]["radius_mm"]
+        assert abs(radius["value"] - 40.0) < 4.0 * radius["sigma"] < 4.0
+
+
+@pytest.mark.parametrize(
+    ("entry", "sentence"),
+    [
+        ({"correction": "wheel"}, "must be module:function"),
+        ({"correction": "wheel:nothing"}, "cannot be loaded"),
+        ({"correction": "nowhere:straight"}, "cannot be loaded"),
+        ({"correction": "wheel:wrong"}, "gives nan"),
+        ({"correction": "wheel:broken"}, "fails at"),
+    ],
+)
+def test_a_correction_that_cannot_be_used_is_refused(tmp_path: Path, entry: dict, sentence: str) -> None:
+    watchers = {"a": Watcher(), "wire": Watcher("distances")}
+    made = watch(Plan(seed=5, poses=30, verify=2, kept_out=2, model=("axis2.x",)), watchers)
+    folder = write_watched(tmp_path / "campaign", made, {"wire": entry})
+    text = (
+        "def wrong(length, direction):\n    return float('nan')\n\ndef broken(length, direction):\n    return 1 / 0\n"
+    )
+    (folder / "wheel.py").write_text(text)
+    with pytest.raises(InvalidInput, match=sentence):
+        run_campaign(folder, out=tmp_path / "run", until="identify")
+
+
+def test_what_belongs_to_a_wire_is_refused_elsewhere(tmp_path: Path) -> None:
+    made = watch(Plan(seed=5, poses=8, verify=2, kept_out=2), {"a": Watcher()})
+    folder = write_watched(tmp_path, made, {"a": {"tension_N": 5.0}})
+    with pytest.raises(InvalidInput, match="'tension_N' belongs to a wire's lengths"):
+        read_campaign(folder)

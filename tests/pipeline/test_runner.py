@@ -36,7 +36,7 @@ def results(folder: Path) -> dict[str, object]:
 
 
 def test_contract_order_of_stages() -> None:
-    order = ("detect", "survey", "orient", "measure", "frames", "identify", "diagnose", "verify", "report")
+    order = ("detect", "survey", "orient", "measure", "frames", "identify", "diagnose", "verify", "hand_eye", "report")
     assert order == STAGE_NAMES
 
 

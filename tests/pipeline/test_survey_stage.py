@@ -1,6 +1,6 @@
 """What a survey takes for targets of its body."""
 
-from pipeline.stages.survey import hardly_seen
+from robcal.recipe.survey import hardly_seen
 
 
 def test_a_misread_code_now_and_then_puts_no_scale_bar_on_the_robot() -> None:

@@ -103,6 +103,7 @@ def _identified(
     found: Found, part: int, instrument: Instrument, rows: Rows, log: JointLog, test: tuple[float, int, float]
 ) -> PlacedInstrument:
     evaluator = found.evaluator
+    instrument = _as_identified(found, part, instrument)
     mine = evaluator.rows[part]
     W, F = evaluator.placed(found.solution.state, part)
     own = evaluator.parts[part]
@@ -145,6 +146,7 @@ def _identified(
     inputs = log.inputs(robot.kernel).subset(sound)
     nominal = fit_nominal(found.engine.kernel.model, inputs, instrument.recording.select(sound))
     held = tuple(coordinate_title(n) for n in titles if n in found.solution.eliminated)
+    held += tuple(f"wire.{k}" for k, n in zip(own.wire, own.wire_names, strict=True) if n in found.solution.eliminated)
     return PlacedInstrument(
         instrument,
         rows,
@@ -159,7 +161,29 @@ def _identified(
         held,
         nominal.model,
         robot.with_recording(log, nominal.model),
+        _wire(found, own),
     )
+
+
+def _wire(found: Found, own: Part) -> dict[str, tuple[float, float]]:
+    """Identified parameters of a wire and their standard deviations."""
+    sigma = dict(zip(found.solution.names, np.sqrt(np.diag(found.statistics.cofactor)).tolist(), strict=True))
+    theta, index = found.solution.state.theta, found.evaluator.index
+    names = zip(own.wire, own.wire_names, strict=True)
+    return {kind: (float(theta[index[n]]), sigma[n]) for kind, n in names if n in sigma}
+
+
+def _as_identified(found: Found, part: int, instrument: Instrument) -> Instrument:
+    """The instrument with its measurements, those kept out as well, seen through the identified wire."""
+    own, theta = found.evaluator.parts[part], found.solution.state.theta
+    if not own.wire:
+        return instrument
+    values = theta[[found.evaluator.index[n] for n in own.wire_names]]
+    recording = instrument.recording
+    observations, detailed = (
+        replace(own, observations=some).with_wire(values) for some in (recording.observations, recording.detailed)
+    )
+    return replace(instrument, recording=replace(recording, observations=observations, detailed=detailed))
 
 
 def _renamed(e: Eliminated, titles: Mapping[str, str]) -> Eliminated:

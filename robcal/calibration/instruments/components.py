@@ -46,14 +46,14 @@ def components(evaluator: JointEvaluator, state: State, weights: Array, poses: P
     """The component of every part, at a solution with weights (n,) and the statistics of its poses."""
     T = evaluator(state).T
     out = []
-    for part, rows in zip(evaluator.parts, evaluator.rows, strict=True):
+    for k, rows in enumerate(evaluator.rows):
         used = weights[rows] > 0
         mine = rows[used]
         numbers = int(evaluator.stack.used[mine].sum())
         redundancy = max(float(poses.redundancy[mine].sum()), LEAST_REDUNDANCY * max(numbers, 1))
         square = float(np.sum(poses.residuals[mine] ** 2))
         share = redundancy / max(numbers, 1)
-        factors = tuple(_factors(o, T[rows], used, share) for o in part.observations)
+        factors = tuple(_factors(o, T[rows], used, share) for o in evaluator.observations_at(state, k))
         p_value = float(stats.chi2.sf(square, redundancy))
         out.append(Component(float(np.sqrt(square / redundancy)), redundancy, p_value, factors))
     return out

@@ -7,14 +7,16 @@ estimation knows of poses holds for several instruments as it does for one.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from robcal.calibration.instruments.cell_frame import CellFrame
 from robcal.calibration.measurements import RobotObservations
-from robcal.calibration.observations import Stack
+from robcal.calibration.observations import DistanceObservations, Stack, Stacked
 from robcal.calibration.problem import Evaluation, Evaluator, State, joint_scatter
+from robcal.calibration.wire import Wire
 from robcal.robot.kernel import Kernel, PoseInputs
 from robcal.robot.model import GEOMETRIC_KINDS
 from robcal.transforms import Array
@@ -24,13 +26,29 @@ Rows = NDArray[np.intp]
 
 @dataclass(frozen=True)
 class Part:
-    """One instrument's share: poses (n), observations by row of these, and its world and tool."""
+    """One instrument's share: poses (n), observations by their row, world and tool, free parameters of a wire."""
 
     name: str
     poses: PoseInputs = field(repr=False)
     observations: tuple[RobotObservations, ...] = field(repr=False)
     world: CellFrame
     tool: CellFrame
+    wire: tuple[str, ...] = ()
+
+    @property
+    def wire_names(self) -> tuple[str, ...]:
+        """Names of the wire's free parameters."""
+        return tuple(f"{self.name}.wire.{kind}" for kind in self.wire)
+
+    def with_wire(self, values: Array) -> tuple[RobotObservations, ...]:
+        """The observations at values (k,) of the wire's free parameters."""
+        if not self.wire:
+            return self.observations
+        given: dict[str, Any] = dict(zip(self.wire, map(float, values), strict=True))
+        return tuple(
+            replace(o, wire=replace(o.wire or Wire(), **given)) if isinstance(o, DistanceObservations) else o
+            for o in self.observations
+        )
 
 
 class JointEvaluator(Evaluator):
@@ -61,8 +79,11 @@ class JointEvaluator(Evaluator):
         super().__init__(kernel, PoseInputs(q, load), Stack(observations, len(q)))
         self.cell = (*self.worlds, *self.tools)
         names = (*kernel.names, *(n for end in self.cell for n in end.parameter_names))
+        self._wires = slice(len(names), len(names) + sum(len(p.wire) for p in parts))
+        names = (*names, *(n for p in parts for n in p.wire_names))
         self.index = {name: k for k, name in enumerate(names)}
-        self.theta0 = np.concatenate([kernel.theta0, np.zeros(6 * len(self.cell))])
+        wires = [start_of_wire(p) for p in parts]
+        self.theta0 = np.concatenate([kernel.theta0, np.zeros(6 * len(self.cell)), *wires])
         self.theta0[[*self._base, *self._tool]] = 0.0
 
     def columns_of(self, end: CellFrame) -> slice:
@@ -73,6 +94,11 @@ class JointEvaluator(Evaluator):
     def placed(self, state: State, part: int) -> tuple[Array, Array]:
         """``world_T_base`` and ``flange_T_tool`` (4, 4) of an instrument."""
         return state.world_T_base[self._world_of[part]], state.flange_T_tool[self._tool_of[part]]
+
+    def observations_at(self, state: State, part: int) -> tuple[RobotObservations, ...]:
+        """Observations of an instrument, by row of its own poses, with the wire's parameters of a state."""
+        own = self.parts[part]
+        return own.with_wire(state.theta[[self.index[n] for n in own.wire_names]])
 
     def __call__(self, state: State) -> Evaluation:
         """The evaluation at a state: all instruments, one after the other."""
@@ -92,22 +118,40 @@ class JointEvaluator(Evaluator):
             for end, columns, frame in ((part.world, self._base, W), (part.tool, self._tool, F)):
                 by_parameter[rows, self.columns_of(end)] = end.twist(frame).T @ J[:, columns]
         frames = np.concatenate(T)
-        stacked = self.stack.evaluate(frames)
+        stacked = self._stacked(state, frames, by_parameter)
         evaluation = Evaluation(frames, np.swapaxes(by_parameter, 1, 2), np.concatenate(moments), stacked.r, stacked.B)
         self._memory = [(state, evaluation), *self._memory[:2]]
         return evaluation
+
+    def _stacked(self, state: State, frames: Array, by_parameter: Array) -> Stacked:
+        """Residuals; columns of the wires' parameters as the twists of the tool that lengthen the wire as much."""
+        if self._wires.start == self._wires.stop:
+            return self.stack.evaluate(frames)
+        observations = []
+        for k, (part, rows) in enumerate(zip(self.parts, self.rows, strict=True)):
+            for o in self.observations_at(state, k) if len(rows) else ():
+                observations.append(replace(o, pose=o.pose + rows[0]))
+                if isinstance(o, DistanceObservations) and o.wire is not None and part.wire:
+                    at = observations[-1].pose
+                    _, B = o.evaluate(frames[rows])
+                    along = B[:, 0] / np.sum(B[:, 0] ** 2, axis=1, keepdims=True)
+                    slopes = o.wire.by_parameter(frames[at, :3, 3], part.wire)
+                    first = self.index[part.wire_names[0]]
+                    by_parameter[at, first : first + len(part.wire)] = slopes[:, :, None] * along[:, None]
+        return self.stack.evaluate(frames, observations)
 
     def fold(self, theta: Array, state: State) -> State:
         """A state with moved parameters, those of worlds and tools folded into their frames."""
         moved = []
         for ends, frames in ((self.worlds, state.world_T_base), (self.tools, state.flange_T_tool)):
             moved.append(np.array([e.moved(T, theta[self.columns_of(e)]) for e, T in zip(ends, frames, strict=True)]))
-        theta[len(self.kernel.names) :] = 0.0
+        theta[len(self.kernel.names) : self._wires.start] = 0.0
         return State(theta, *moved)
 
     def deviations(self, state: State) -> Array:
         """How far each parameter is from where priors expect it: worlds and tools from what is given of them."""
         out = state.theta.copy()
+        out[self._wires] -= self.theta0[self._wires]
         for end, T in zip(self.cell, (*state.world_T_base, *state.flange_T_tool), strict=True):
             out[self.columns_of(end)] = end.deviation(T)
         return out
@@ -129,6 +173,12 @@ class JointEvaluator(Evaluator):
         out[:6, :6] = self.parts[part].world.twist(W)
         out[6:, 6:] = self.parts[part].tool.twist(F)
         return out
+
+
+def start_of_wire(part: Part) -> Array:
+    """Values (k,) of the wire's free parameters as its measurements state them."""
+    stated = next((o.wire for o in part.observations if isinstance(o, DistanceObservations) and o.wire), Wire())
+    return np.array([getattr(stated, kind) for kind in part.wire])
 
 
 def kernel_ends() -> tuple[str, ...]:

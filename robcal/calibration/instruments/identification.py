@@ -40,7 +40,7 @@ class _Task:
         return JointEvaluator(
             self.kernel,
             [
-                Part(i.name, inputs.subset(rows), i.recording.select(rows), i.world, i.tool)
+                Part(i.name, inputs.subset(rows), i.recording.select(rows), i.world, i.tool, i.wire)
                 for i in instruments
                 if len(rows := self.rows[i.name])
             ],
@@ -114,7 +114,8 @@ def _candidates(model: RobotModel, options: IdentifyOptions, evaluator: JointEva
     for name in (*robot, *options.priors):
         if name not in evaluator.index:
             raise InvalidInput(f"robot '{model.name}' has no parameter '{name}'")
-    return replace(chosen, forced=(*ends, *robot))
+    wires = [name for part in evaluator.parts for name in part.wire_names]
+    return replace(chosen, forced=(*ends, *robot, *wires))
 
 
 def _priors(evaluator: JointEvaluator, options: IdentifyOptions) -> dict[str, float]:

@@ -28,12 +28,14 @@ class Instrument:
     ----------
     recording : its measurements, by row of the joint log.
     world, tool : what is known of them; instruments that share one have the very same.
+    wire : parameters of a draw-wire (:data:`robcal.calibration.wire.LIMITS`) that are identified with the robot.
     """
 
     name: str
     recording: RobotRecording = field(repr=False)
     world: CellFrame
     tool: CellFrame
+    wire: tuple[str, ...] = ()
 
     @property
     def kind(self) -> str:

@@ -31,6 +31,7 @@ class PlacedInstrument:
     held : coordinates that its measurements do not tell.
     nominal : the nominal robot in the best cell of this instrument.
     robot : the robot as this instrument sees it: base and tool are its own. None if it verifies only.
+    wire : identified parameters of a draw-wire with their standard deviations (SI), by name.
     """
 
     instrument: Instrument
@@ -46,6 +47,7 @@ class PlacedInstrument:
     held: tuple[str, ...]
     nominal: RobotModel = field(repr=False)
     robot: IdentifiedRobot | None = field(repr=False, default=None)
+    wire: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     @property
     def recording(self) -> RobotRecording:

@@ -12,6 +12,7 @@ from robcal.calibration.observations import (
     PointObservations,
     SensorPointObservations,
 )
+from robcal.calibration.wire import Wire
 from robcal.diagnosis.core.decorrelation import CommonNoise, SharedNoise
 from robcal.errors import InvalidInput
 from robcal.physics.cause import Array, ObservationData
@@ -172,7 +173,8 @@ def observation_data(recording: Recording, frames: Array, variables: Mapping[str
         return ObservationData("frames", obs.pose, none, T, np.zeros((m, 3)), T[:, :3, 3], None, variables)
     if isinstance(obs, DistanceObservations):
         none = np.full(m, -1)
-        return ObservationData("distances", obs.pose, none, T, np.zeros((m, 3)), T[:, :3, 3], None, variables)
+        zero, wire = np.zeros((m, 3)), obs.wire or Wire()
+        return ObservationData("distances", obs.pose, none, T, zero, T[:, :3, 3], None, variables, wire)
     if isinstance(obs, SensorPointObservations):
         none = np.full(m, -1)
         return ObservationData(

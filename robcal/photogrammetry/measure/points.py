@@ -14,7 +14,7 @@ from robcal.photogrammetry.core.camera import project
 from robcal.photogrammetry.core.eccentricity import effective_point
 from robcal.photogrammetry.measure.measured_points import MeasuredPoints, RejectedPoint, ResectedPoses
 from robcal.photogrammetry.measure.resected_poses import resect_poses
-from robcal.photogrammetry.orientation.intersection import Intersection, intersect
+from robcal.photogrammetry.orientation.intersection import Intersection, Rays, intersect
 from robcal.photogrammetry.station.network import MarkTable, StationMarks, StationOrientation
 from robcal.transforms import Array, invert, skew, transform
 
@@ -98,16 +98,16 @@ def _intersected(
         width, none = 6 * len(orientation.world_T_exterior) + 9 * len(orientation.names), np.empty(0, dtype=np.int64)
         empty = np.empty((0, 3, 3))
         return _Points(none, none, empty[:, 0], empty, none, np.empty(0), np.empty((0, 3, width))), (), []
-    out = intersect(
+    rays = Rays(
         point,
         table.camera[several],
         xy[several],
         table.covariance[several],
         orientation.cameras,
         orientation.world_T_exterior,
-        exterior=table.exterior[several],
-        critical=critical,
+        table.exterior[several],
     )
+    out = intersect(rays, critical)
     pose, target = poses[keys // (len(body) + 1)], body.ids[keys % (len(body) + 1)]
     keep, inconsistent, rejected = _consistent(out, pose, target, critical, suspect)
     by_station = [np.moveaxis(J, 1, 2).reshape(len(keys), 3, -1) for J in (out.by_exterior, out.by_interior)]

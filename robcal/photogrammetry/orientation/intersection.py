@@ -7,6 +7,7 @@ a derivative by the station's parameters, so that a user can propagate it throug
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,85 +47,69 @@ class Intersection:
     whitened: Array
 
 
-def intersect(
-    point: IntArray,
-    camera: IntArray,
-    xy: Array,
-    covariance: Array,
-    cameras: Sequence[Camera],
-    world_T_camera: Array,
-    *,
-    exterior: IntArray | None = None,
-    critical: float = 4.0,
-    iterations: int = 8,
-) -> Intersection:
-    """Intersect the rays of each point; with three or more rays one that contradicts the others is left out.
+@dataclass(frozen=True)
+class Rays:
+    """Marks of points in images of known orientation, m rays.
 
-    Parameters
+    Attributes
     ----------
     point : (m,) number of the point, 0 .. n-1; camera : (m,) number of the camera.
     xy, covariance : (m, 2) px, (m, 2, 2) px^2.
     world_T_camera : (e, 4, 4); ``exterior`` (m,) tells which of them a ray uses (default: its camera's).
-    critical : limit of the normalised contradiction of a ray (in standard deviations).
+    left_out : (m,) rays that take no part; None: all do whose camera's distortion can be inverted there.
     """
-    if len(point) == 0:
-        raise InvalidInput("no marks to intersect")
-    station = camera if exterior is None else exterior
-    ideal = np.empty_like(xy)
-    for c, cam in enumerate(cameras):
-        ideal[camera == c] = normalise(cam, xy[camera == c])
-    used = np.asarray(np.isfinite(ideal).all(axis=1))
-    n = int(point.max()) + 1
-    rays = _Rays(n, point, camera, tuple(cameras), world_T_camera[station], xy, whitener(covariance), used)
-    p, regular = rays.start(ideal)
-    at = np.flatnonzero(regular)
 
-    def refined(rays: _Rays) -> None:
-        settings = TerminationSettings(iterations, negligible=1e-10)
-        p[at] = minimise_each(lambda x, chosen: rays.equations(x, at[chosen]), np.add, p[at], settings).state
-
-    refined(rays)
-    while rays.count.max(initial=0) >= 3:
-        drop = rays.contradictions(p, regular, critical)
-        if not drop.any():
-            break
-        rays = replace(rays, used=rays.used & ~drop)
-        refined(rays)
-    r, J, d_ext, d_in = rays.linearise(p)
-    Q = _inverse(sum_by(point, np.swapaxes(J, -1, -2) @ J, n), regular)
-    # implicit derivative: dp = -Q J' (J_station) d station
-    pull = -Q[point] @ np.swapaxes(J, -1, -2)
-    pull = np.where(np.isfinite(pull), pull, 0.0)
-    c, e = len(cameras), len(world_T_camera)
-    by_ext = sum_by(point * e + station, pull @ d_ext, n * e).reshape(n, e, 3, 6)
-    by_int = sum_by(point * c + camera, pull @ d_in, n * c).reshape(n, c, 3, 9)
-    chi2 = sum_by(point, np.sum(r**2, axis=1), n)
-    Q[~regular] = np.nan
-    return Intersection(p, Q, by_ext, by_int, rays.count, chi2, rays.used, r)
-
-
-@dataclass(frozen=True)
-class _Rays:
-    """Rays (m,) to n points: numbers of point and camera, world_T_camera (m, 4, 4), px with whiteners (m, 2, 2), and
-    which take part."""
-
-    n: int
     point: IntArray
     camera: IntArray
-    cameras: tuple[Camera, ...]
-    T: Array
     xy: Array
-    W: Array
-    used: NDArray[np.bool_]
+    covariance: Array
+    cameras: Sequence[Camera]
+    world_T_camera: Array
+    exterior: IntArray | None = None
+    left_out: NDArray[np.bool_] | None = None
 
-    @property
+    @cached_property
+    def n(self) -> int:
+        """Number of points."""
+        return int(self.point.max(initial=-1)) + 1
+
+    @cached_property
+    def station(self) -> IntArray:
+        """(m,) exterior orientation of each ray."""
+        return self.camera if self.exterior is None else self.exterior
+
+    @cached_property
+    def T(self) -> Array:
+        """(m, 4, 4) world_T_camera of each ray."""
+        return self.world_T_camera[self.station]
+
+    @cached_property
+    def W(self) -> Array:
+        """(m, 2, 2) whiteners of the marks."""
+        return whitener(self.covariance)
+
+    @cached_property
+    def ideal(self) -> Array:
+        """(m, 2) image points without distortion, NaN where it cannot be inverted."""
+        ideal = np.empty_like(self.xy)
+        for c, camera in enumerate(self.cameras):
+            ideal[self.camera == c] = normalise(camera, self.xy[self.camera == c])
+        return ideal
+
+    @cached_property
+    def used(self) -> NDArray[np.bool_]:
+        """(m,) rays that take part."""
+        finite = np.asarray(np.isfinite(self.ideal).all(axis=1))
+        return finite if self.left_out is None else finite & ~self.left_out
+
+    @cached_property
     def count(self) -> IntArray:
         """(n,) rays of each point that take part."""
         return np.bincount(self.point[self.used], minlength=self.n).astype(np.int64)
 
-    def start(self, ideal: Array) -> tuple[Array, NDArray[np.bool_]]:
+    def start(self) -> tuple[Array, NDArray[np.bool_]]:
         """Points (n, 3) nearest to the rays' lines (NaN where these do not meet), and which (n,) have one."""
-        direction = np.einsum("mij,mj->mi", self.T[:, :3, :3], np.column_stack([ideal, np.ones(len(ideal))]))
+        direction = np.einsum("mij,mj->mi", self.T[:, :3, :3], np.column_stack([self.ideal, np.ones(len(self.ideal))]))
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
         across = np.eye(3) - direction[:, :, None] * direction[:, None, :]
         across = np.where(self.used[:, None, None], across, 0.0)
@@ -160,6 +145,8 @@ class _Rays:
 
     def contradictions(self, p: Array, regular: NDArray[np.bool_], critical: float) -> NDArray[np.bool_]:
         """(m,) the worst ray of each point with three or more, if its redundancy-normalised residual is too large."""
+        if self.count.max(initial=0) < 3:
+            return np.zeros(len(self.point), dtype=bool)
         r, J, _, _ = self.linearise(p)
         Q = _inverse(sum_by(self.point, np.swapaxes(J, -1, -2) @ J, self.n), regular)
         V = np.eye(2) - J @ Q[self.point] @ np.swapaxes(J, -1, -2)
@@ -168,6 +155,44 @@ class _Rays:
         np.maximum.at(worst, self.point, np.where(self.used, T2, 0.0))
         largest = (self.count[self.point] >= 3) & (worst[self.point] == T2)
         return np.asarray(self.used & largest & (critical**2 + 2 < T2))
+
+
+def intersect(rays: Rays, critical: float = 4.0) -> Intersection:
+    """Intersect the rays of each point; with three or more rays one that contradicts the others is left out.
+
+    ``critical`` is the limit of the normalised contradiction of a ray, in standard deviations.
+
+    Raises
+    ------
+    InvalidInput : no rays.
+    """
+    if len(rays.point) == 0:
+        raise InvalidInput("no marks to intersect")
+    p, regular = rays.start()
+    at = np.flatnonzero(regular)
+    settings = TerminationSettings(8, negligible=1e-10)
+    while True:
+        p[at] = minimise_each(partial(_equations, rays, at), np.add, p[at], settings).state
+        drop = rays.contradictions(p, regular, critical)
+        if not drop.any():
+            break
+        rays = replace(rays, left_out=drop if rays.left_out is None else rays.left_out | drop)
+    point, n = rays.point, rays.n
+    r, J, d_ext, d_in = rays.linearise(p)
+    Q = _inverse(sum_by(point, np.swapaxes(J, -1, -2) @ J, n), regular)
+    # implicit derivative: dp = -Q J' (J_station) d station
+    pull = -Q[point] @ np.swapaxes(J, -1, -2)
+    pull = np.where(np.isfinite(pull), pull, 0.0)
+    c, e = len(rays.cameras), len(rays.world_T_camera)
+    by_ext = sum_by(point * e + rays.station, pull @ d_ext, n * e).reshape(n, e, 3, 6)
+    by_int = sum_by(point * c + rays.camera, pull @ d_in, n * c).reshape(n, c, 3, 9)
+    chi2 = sum_by(point, np.sum(r**2, axis=1), n)
+    Q[~regular] = np.nan
+    return Intersection(p, Q, by_ext, by_int, rays.count, chi2, rays.used, r)
+
+
+def _equations(rays: Rays, at: IntArray, x: Array, chosen: IntArray) -> NormalEquations:
+    return rays.equations(x, at[chosen])
 
 
 def _regular(N: Array) -> Array:

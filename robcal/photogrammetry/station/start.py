@@ -1,5 +1,6 @@
 """Start values of a station: focal lengths where unknown, resections, relative orientation of the cameras by vote."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -191,54 +192,68 @@ def connect_cameras(
     by_camera: list[dict[int, tuple[Array, ...]]] = [{} for _ in range(c)]
     for s in starts:
         by_camera[s.camera][s.pose] = s.candidates
-    edges: list[tuple[float, int, int, Array]] = []
-    against: dict[tuple[int, int], int] = {}
-    for_it: dict[tuple[int, int], int] = {}
-    for a in range(c):
-        for b in range(a + 1, c):
-            common = sorted(set(by_camera[a]) & set(by_camera[b]))
-            if not common:
-                continue
-            a_T_b, support = vote_relative([by_camera[a][p] for p in common], [by_camera[b][p] for p in common])
-            if len(common) >= 5 and (support > 0.01).sum() < 0.5 * len(common):
-                _refuse_slipped(names[a], names[b], by_camera[a], by_camera[b], int((support > 0.1).sum()), len(common))
-            edges.append((float(support.sum()), a, b, a_T_b))
-            for p, s in zip(common, support, strict=True):
-                tally = against if s < 0.01 and len(common) > 2 else for_it
-                for camera in (a, b):
-                    tally[(camera, p)] = tally.get((camera, p), 0) + 1
-    out = np.broadcast_to(np.eye(4), (c, 4, 4)).copy()
-    done: set[int] = set()
-    fixed: list[int] = []
+    pairs = _related_cameras(names, by_camera)
+    against: Counter[tuple[int, int]] = Counter()
+    for pair in pairs:
+        for p, support in zip(pair.poses, pair.support, strict=True):
+            worth = 1 if support < 0.01 and len(pair.poses) > 2 else -1
+            against.update({(camera, p): worth for camera in (pair.first, pair.second)})
+    bad = [key for key, n in against.items() if n > 0]
     stated = [i for i, name in enumerate(names) if name in world_T_camera]
+    given = {i: np.asarray(world_T_camera[names[i]]) for i in stated}
+    placed: dict[int, Array] = {}
+    fixed: list[int] = []
     root = stated[0] if stated else 0
-    while len(done) < c:
-        if root in stated:
-            out[root] = world_T_camera[names[root]]
+    while True:
         fixed.append(root)
-        done.add(root)
-        while True:
-            usable = [e for e in edges if (e[1] in done) != (e[2] in done)]
-            if not usable:
-                break
-            _, a, b, a_T_b = max(usable, key=lambda e: e[0])
-            if a in done:
-                out[b] = out[a] @ a_T_b
-                done.add(b)
-            else:
-                out[a] = out[b] @ invert(a_T_b)
-                done.add(a)
-        left = [i for i in range(c) if i not in done]
-        if left:
-            roots = [i for i in left if i in stated]
-            if not roots or not stated:
-                raise InvalidInput(
-                    f"camera {names[left[0]]} shares no pose with {names[root]}: it cannot be oriented. Record poses "
-                    f"in which both see at least three targets, or state world_T_camera in its camera file"
-                )
-            root = roots[0]
-    bad = [key for key, n in against.items() if n > for_it.get(key, 0)]
-    return out, fixed, bad
+        placed[root] = given.get(root, np.eye(4))
+        _place_related(placed, pairs)
+        left = [i for i in range(c) if i not in placed]
+        if not left:
+            break
+        roots = [i for i in left if i in given]
+        if not roots:
+            raise InvalidInput(
+                f"camera {names[left[0]]} shares no pose with {names[root]}: it cannot be oriented. Record poses in "
+                "which both see at least three targets, or state world_T_camera in its camera file"
+            )
+        root = roots[0]
+    return np.array([placed[i] for i in range(c)]), fixed, bad
+
+
+@dataclass(frozen=True)
+class _Pair:
+    """Two cameras with a relative orientation, and how far (0 .. 1) each of their common poses supports it."""
+
+    first: int
+    second: int
+    first_T_second: Array
+    poses: list[int]
+    support: Array
+
+
+def _related_cameras(names: Sequence[str], by_camera: Sequence[Mapping[int, tuple[Array, ...]]]) -> list[_Pair]:
+    """All pairs of cameras that share poses."""
+    pairs: list[_Pair] = []
+    for a, b in combinations(range(len(names)), 2):
+        common = sorted(set(by_camera[a]) & set(by_camera[b]))
+        if not common:
+            continue
+        a_T_b, support = vote_relative([by_camera[a][p] for p in common], [by_camera[b][p] for p in common])
+        if len(common) >= 5 and (support > 0.01).sum() < 0.5 * len(common):
+            _refuse_slipped(names[a], names[b], by_camera[a], by_camera[b], int((support > 0.1).sum()), len(common))
+        pairs.append(_Pair(a, b, a_T_b, common, support))
+    return pairs
+
+
+def _place_related(placed: dict[int, Array], pairs: Sequence[_Pair]) -> None:
+    """Place all cameras that are linked to one placed already, along the best supported links."""
+    while usable := [p for p in pairs if (p.first in placed) != (p.second in placed)]:
+        best = max(usable, key=lambda p: float(p.support.sum()))
+        if best.first in placed:
+            placed[best.second] = placed[best.first] @ best.first_T_second
+        else:
+            placed[best.first] = placed[best.second] @ invert(best.first_T_second)
 
 
 def _refuse_slipped(

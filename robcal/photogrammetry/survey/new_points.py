@@ -15,6 +15,9 @@ from robcal.photogrammetry.core.network import IntArray
 from robcal.photogrammetry.survey.matching import Geometry, Sightings
 from robcal.transforms import Array, transform
 
+_PARTNERS = 4
+"""Images with which one is intersected."""
+
 
 @dataclass(frozen=True)
 class NewPoints:
@@ -34,7 +37,6 @@ def find_new_points(
     radius: float,
     min_images: int = 3,
     gate: float = 2.0,
-    partners: int = 4,
 ) -> NewPoints:
     """New points from detections that belong to no known point.
 
@@ -60,7 +62,7 @@ def find_new_points(
         if len(mine) == 0:
             continue
         candidates = [np.zeros((0, 3))]
-        for j in _partners(angle[i], sightings.image[free], partners):
+        for j in _partners(angle[i], sightings.image[free], _PARTNERS):
             other = np.flatnonzero(free & (sightings.image == j))
             if len(other):
                 pair = station[i], rays[mine], station[j], rays[other]

@@ -6,6 +6,7 @@ and a calibration does not know (effort, velocity, moments of inertia) gets the 
 """
 
 import math
+from collections.abc import Sequence
 from typing import Any
 from xml.etree import ElementTree
 
@@ -128,10 +129,21 @@ def _from_template(model: RobotModel, template: str) -> str:
     builder = ElementTree.TreeBuilder(insert_comments=True)
     root = ElementTree.fromstring(template, parser=ElementTree.XMLParser(target=builder))
     elements = {e.get("name"): e for e in root.iter("joint") if e.find("parent") is not None}
-    frames = list(zip(nominal.frames, calibrated_frames(model), strict=True))
+    for step, (origin, axis) in zip(steps, calibrated_origins(model, nominal, steps), strict=True):
+        _replace(elements[step.name], "origin", xyz=_text(origin[:3, 3]), rpy=_text(rpy_from_rotation(origin[:3, :3])))
+        _replace(elements[step.name], "axis", xyz=_text(axis))
+    return '<?xml version="1.0"?>\n' + ElementTree.tostring(root, encoding="unicode") + "\n"
+
+
+def calibrated_origins(model: RobotModel, nominal: RobotModel, steps: Sequence[UrdfStep]) -> list[tuple[Array, Array]]:
+    """Origin (4, 4) and axis (3,) of each moving joint, in URDF's sense, with the deviations of a calibrated robot.
+
+    ``nominal`` is the robot as it was read from the joints ``steps`` (fixed ones between them left out).
+    """
+    found = []
     old, new = np.eye(4), np.eye(4)  # from the joint frame before, fixed frames between included
     moving = iter(steps)
-    for before, after in frames:
+    for before, after in zip(nominal.frames, calibrated_frames(model), strict=True):
         old, new = (T @ frame_from_xyzrpy([*f.xyz, *f.rpy]) for T, f in ((old, before), (new, after)))
         if before.axis is None:
             continue
@@ -140,11 +152,9 @@ def _from_template(model: RobotModel, template: str) -> str:
         # old = carry origin link_T_frame; what stands before the joint's own origin stays
         carry = old @ invert(link_T_frame) @ invert(step.origin)
         origin = invert(carry) @ new @ invert(link_T_frame)
-        axis = link_T_frame[:3, :3] @ joint_axis_in_child(after)
-        _replace(elements[step.name], "origin", xyz=_text(origin[:3, 3]), rpy=_text(rpy_from_rotation(origin[:3, :3])))
-        _replace(elements[step.name], "axis", xyz=_text(axis))
+        found.append((origin, link_T_frame[:3, :3] @ joint_axis_in_child(after)))
         old, new = np.eye(4), np.eye(4)
-    return '<?xml version="1.0"?>\n' + ElementTree.tostring(root, encoding="unicode") + "\n"
+    return found
 
 
 def _link_T_frame(step: UrdfStep, before: Frame) -> Array:

@@ -3,7 +3,7 @@
 import numpy as np
 
 from robcal.photogrammetry.core.camera import project
-from robcal.photogrammetry.orientation.intersection import intersect
+from robcal.photogrammetry.orientation.intersection import Rays, intersect
 from robcal.transforms import invert, retract, transform
 from tests.photogrammetry.stations import nees, simulate
 
@@ -22,33 +22,33 @@ def _rays(cameras=2, n=200, sigma=0.02, seed=0):
 
 def test_noise_is_what_the_covariance_says():
     p, point, camera, xy, C, lenses, T = _rays(n=800)
-    out = intersect(point, camera, xy, C, lenses, T)
+    out = intersect(Rays(point, camera, xy, C, lenses, T))
     assert 0.9 < nees(out.p_world - p, out.covariance).mean() < 1.1
     assert 0.9 < out.chi2.mean() < 1.1
 
 
 def test_derivative_by_the_station():
     _, point, camera, xy, C, lenses, T = _rays(n=3)
-    base = intersect(point, camera, xy, C, lenses, T)
+    base = intersect(Rays(point, camera, xy, C, lenses, T))
     for e in range(2):
         for k in range(6):
             step = np.zeros(6)
             step[k] = 1e-6
             moved = T.copy()
             moved[e] = retract(T[e], step)
-            numeric = (intersect(point, camera, xy, C, lenses, moved).p_world - base.p_world) / 1e-6
+            numeric = (intersect(Rays(point, camera, xy, C, lenses, moved)).p_world - base.p_world) / 1e-6
             assert np.allclose(base.by_exterior[:, e, :, k], numeric, atol=2e-2 * np.abs(numeric).max() + 1e-6)
     step = np.zeros(9)
     step[2] = 1e-3
     lens = [lenses[0].with_vector(lenses[0].vector + step), lenses[1]]
-    numeric = (intersect(point, camera, xy, C, lens, T).p_world - base.p_world) / 1e-3
+    numeric = (intersect(Rays(point, camera, xy, C, lens, T)).p_world - base.p_world) / 1e-3
     assert np.allclose(base.by_interior[:, 0, :, 2], numeric, rtol=1e-2, atol=1e-9)
 
 
 def test_one_bad_ray_of_three_is_left_out():
     p, point, camera, xy, C, lenses, T = _rays(cameras=3, n=20)
     xy[5 * 3 + 1] += [1.0, -2.0]
-    out = intersect(point, camera, xy, C, lenses, T)
+    out = intersect(Rays(point, camera, xy, C, lenses, T))
     assert not out.used[16]
     assert out.used.sum() == 59
     assert out.n_cameras[5] == 2

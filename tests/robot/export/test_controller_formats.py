@@ -11,6 +11,7 @@ from robcal.errors import InvalidInput
 from robcal.robot.export.controller_formats import RESERVED, frame_program, joint_program, program_name, quaternion
 from robcal.robot.model import Frame, RobotModel
 from robcal.transforms import exp_so3, frame, frame_from_xyzrpy
+from tests.programs.small_parser import PARSERS
 from tests.robot.chains import kr_like
 
 RNG = np.random.default_rng(0)
@@ -132,3 +133,18 @@ def test_names_of_files_become_names_that_controllers_take(text):
 def test_names_that_no_controller_takes_are_refused(name):
     with pytest.raises(InvalidInput, match="program name"):
         frame_program(T, "rapid", name)
+
+
+def test_a_second_reader_finds_tool_base_and_targets():
+    """The programs as another parser reads them: joint values first, then every target with the calibrated tool."""
+    model = kr_like()
+    for dialect in ("krl", "rapid", "urscript"):
+        text = frame_program(T, dialect, flange_T_tool=TOOL, model=model, q=Q)
+        parser = PARSERS[dialect]
+        found = parser(text, np.eye(4)) if dialect == "urscript" else parser(text)
+        assert found[0].q == pytest.approx(Q[0], abs=1e-6)
+        assert len(found) == len(T)
+        for motion, target in zip(found[1:], T[1:], strict=True):
+            assert pytest.approx(target, abs=1e-6) == motion.T
+            assert motion.tool == pytest.approx(TOOL, abs=1e-6)
+            assert motion.base == pytest.approx(np.eye(4))

@@ -1,0 +1,1 @@
+"""Programs of robot controllers, corrected in place: KUKA KRL, ABB RAPID, URScript, Fanuc TP (LS)."""
