@@ -22,6 +22,7 @@ Groups = Mapping[str, tuple[str, ...]]
 
 FEW = 60
 """Different poses below which single ones are left out in place of blocks."""
+CURVES = "curves of the joints"
 MOVED_SHARE = 0.5
 """Moves of the station are taken back where at most this share of the error stays: else the robot would speak in a
 frame that only some of the poses vouch for."""
@@ -203,7 +204,10 @@ def _is_move(item: Accepted) -> bool:
 
 
 def groups_of(bare: Form, extended: Form) -> Groups:
-    """What was added to a form, by name: the amplitudes of a term together, a parameter that was set free by itself."""
+    """What was added to a form, by name: the amplitudes of a term together, a parameter that was set free by itself.
+
+    Curves that their priors hold back were accepted together, over folds, and share parts: they stand or fall together.
+    """
     present = {name for term in bare.model.terms for name in term.parameter_names} | set(bare.free)
     groups: dict[str, tuple[str, ...]] = {}
     of_terms: set[str] = set()
@@ -211,7 +215,8 @@ def groups_of(bare: Form, extended: Form) -> Groups:
         names = tuple(name for name in term.parameter_names if name not in present)
         of_terms.update(term.parameter_names)
         if names:
-            groups[term.name] = tuple(dict.fromkeys((*groups.get(term.name, ()), *names)))
+            group = CURVES if term.priors else term.name
+            groups[group] = tuple(dict.fromkeys((*groups.get(group, ()), *names)))
     return groups | {name: (name,) for name in extended.free if name not in present | of_terms}
 
 
