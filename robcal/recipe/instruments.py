@@ -177,6 +177,8 @@ def _on_rows(
 def _by_folds(
     model: RobotModel, found: IdentifiedInstruments, log: JointLog, options: IdentifyOptions | None
 ) -> dict[str, Verification]:
+    terms = leading_identification(found).robot.model.terms
+    model = replace(model, terms=terms)
     groups = repetitions(log.q)
     folds = min(FOLDS, int(groups.max()) + 1)
     fold = (np.argsort(np.random.default_rng(0).permutation(int(groups.max()) + 1)) % folds)[groups]
