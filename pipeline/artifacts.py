@@ -50,6 +50,8 @@ FRAMES: Artifact[MeasuredFrames] = Artifact("frames", "frames")
 IDENTIFICATION: Artifact[Identification] = Artifact("identify", "identify")
 INSTRUMENTS: Artifact[IdentifiedInstruments] = Artifact("instruments", "identify")
 """Where a campaign has several instruments, or one of whose world or tool something is known."""
+DIAGNOSED_INSTRUMENTS: Artifact[IdentifiedInstruments] = Artifact("diagnosed_instruments", "diagnose")
+"""All instruments identified anew beside what a diagnosis found."""
 CALIBRATED: Artifact[CalibratedRobot] = Artifact("calibrated", "diagnose")
 """The robot in force after the diagnosis."""
 EVIDENCE: Artifact[Evidence] = Artifact("evidence", "diagnose")

@@ -57,6 +57,13 @@ def joint_doubts(campaign: Campaign) -> Looked:
                 "joint over its range"
             )
     doubts += _few(where, int(identify.sum()), int(poses.verify.sum()))
+    loaded = {name for name in poses.payload if name is not None}
+    doubts += [
+        f"{campaign.path}, line {campaign.document.line(('payloads', name))}: payload '{name}' has a mass of 0 kg: "
+        "state it"
+        for name in sorted(loaded)
+        if robot.payloads[name].mass == 0
+    ]
     places = np.round(shown, 3)
     again = len(places) - len(np.unique(places, axis=0))
     if again > len(places) // 2:

@@ -19,6 +19,8 @@ from robcal.files.images import read_image
 from robcal.imaging.detect import detect_targets
 from robcal.imaging.detections import Detections
 from robcal.imaging.settings import DetectionSettings
+from robcal.photogrammetry.boards.detect import find_board
+from robcal.photogrammetry.boards.layout import Board
 from robcal.recipe.detection import detection_settings
 
 NAME = "detect"
@@ -32,6 +34,7 @@ class _Job:
     cache: str
     key: str
     settings: DetectionSettings
+    board: Board | None
 
 
 def sources(campaign: Campaign) -> dict[str, tuple[ImageSource, BodyFile, SurveyEntry | None]]:
@@ -67,7 +70,11 @@ def _detect(job: _Job) -> ImageEntry:
             found = None  # damaged: detect again
     if found is None:
         try:
-            found = detect_targets(read_image(job.path), job.settings)
+            image = read_image(job.path)
+            if job.board is None:
+                found = detect_targets(image, job.settings)
+            else:
+                found = find_board(image, job.board, job.settings.polarity)
         except RobcalError as error:
             told = str(error) if str(job.path) in str(error) else f"{job.path}: {error}"
             return ImageEntry(job.source, job.name, job.path, None, (0, 0), 0, 0, 0, told)
@@ -86,19 +93,24 @@ def work(context: Context) -> Outcome:
     campaign, run = context.campaign, context.run
     jobs: list[_Job] = []
     hashes: dict[str, dict[str, str]] = {}
-    version = code_version("robcal.files.images", "robcal.imaging.detect")
+    version = code_version("robcal.files.images", "robcal.photogrammetry.boards.detect")
     for source, (images, body, survey) in sources(campaign).items():
         settings = settings_for(body, survey)
         for name, path in images.images.items():
             content = run.hash(path)
             refuse_duplicate(hashes.setdefault(source, {}), content, path)
-            key = fingerprint(content, codec.encode(settings, {}), version)[:32]
-            jobs.append(_Job(source, name, path, str(run.artifact(detections(key))), key, settings))
+            key = fingerprint(content, codec.encode([settings, body.board], {}), version)[:32]
+            jobs.append(_Job(source, name, path, str(run.artifact(detections(key))), key, settings, body.board))
     results = in_processes(_detect, jobs, context.workers)
     entries = list(track(results, len(jobs), "detecting targets"))
     refuse_unreadable(entries)
     notes = [
         note for source, (images, _, _) in sources(campaign).items() for note in check_images(source, images, entries)
+    ]
+    notes += [
+        f"{body.path}: {body.board.same_when_turned}"
+        for _, body, _ in sources(campaign).values()
+        if body.board is not None and body.board.turns > 1
     ]
     index = DetectionIndex(tuple(entries))
     path = run.save(DETECTED, index)
@@ -119,7 +131,7 @@ STAGE = Stage(
         path for images, body, _ in sources(campaign).values() for path in (*images.images.values(), body.path)
     ],
     settings=lambda campaign: {
-        source: [codec.encode(settings_for(body, survey), {}), list(images.images), images.size]
+        source: [codec.encode([settings_for(body, survey), body.board], {}), list(images.images), images.size]
         for source, (images, body, survey) in sources(campaign).items()
     },
     after=(),

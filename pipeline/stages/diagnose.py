@@ -8,6 +8,7 @@ from pipeline import artifacts
 from pipeline.adjusted_images import findings_of
 from pipeline.bodies import body_for_robot
 from pipeline.campaign import Campaign
+from pipeline.instruments_diagnosis import diagnose_several
 from pipeline.json_io import write_json
 from pipeline.messages import LOG
 from pipeline.stages.base import Context, Outcome, Stage, no_files
@@ -37,7 +38,7 @@ def work(context: Context) -> Outcome:
         result = {"mismatch": content["mismatch"], "p_value": content["p_value"], "causes": _named(images.findings)}
         return Outcome({"diagnosis": result | {"heldout_px": content["heldout_px"]}}, [run.diagnosis], told)
     if campaign.instruments:
-        return Outcome(notes=["several instruments: the robot is not diagnosed"])
+        return diagnose_several(context, settings_of(campaign))
     station = run.find(artifacts.ORIENTATION)  # None where another system measured
     measured = Measured(body_for_robot(campaign, run), run.find(artifacts.POINTS), station)
     identification = run.load(artifacts.IDENTIFICATION)

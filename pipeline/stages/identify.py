@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.artifacts import CALIBRATED, HAND_EYE, IDENTIFICATION, INSTRUMENTS
+from pipeline.artifacts import CALIBRATED, DIAGNOSED_INSTRUMENTS, HAND_EYE, IDENTIFICATION, INSTRUMENTS
 from pipeline.bodies import body_for_robot
 from pipeline.campaign import Campaign
 from pipeline.instrument_results import instrument_notes, instruments_result
@@ -13,6 +13,7 @@ from pipeline.stages.base import Context, Outcome, Stage
 from pipeline.stages.observations import build_instruments, build_recording, corrections_of
 from robcal.calibration.calibrated import CalibratedRobot
 from robcal.calibration.identification import IdentifiedRobot, IdentifyOptions
+from robcal.calibration.instruments import IdentifiedInstruments
 from robcal.calibration.measurements import RobotRecording, Rows
 from robcal.calibration.recording_errors import mirror_residuals
 from robcal.calibration.recording_errors.search import fault_of
@@ -184,6 +185,11 @@ def _notes(found: IdentifiedRobot, poses: Poses, rows: Rows) -> list[str]:
     return notes
 
 
+def instruments_in_force(run: Run) -> IdentifiedInstruments | None:
+    """All instruments with what a diagnosis found; None where a campaign has but one of which nothing is known."""
+    return run.find(DIAGNOSED_INSTRUMENTS) or run.find(INSTRUMENTS)
+
+
 def load_calibrated(run: Run, instrument: str | None = None) -> CalibratedRobot:
     """The robot with all that was found out about it: after the diagnosis where there was one.
 
@@ -197,7 +203,7 @@ def load_calibrated(run: Run, instrument: str | None = None) -> CalibratedRobot:
     identified = run.find(IDENTIFICATION)
     if robot is None and identified is not None:
         robot = identified.robot
-    instruments = run.find(INSTRUMENTS)
+    instruments = instruments_in_force(run)
     if instruments is None and instrument is not None:
         raise InvalidInput(f"{run.folder}: the campaign has one instrument: leave --instrument out")
     if robot is not None and instruments is not None:
@@ -207,7 +213,10 @@ def load_calibrated(run: Run, instrument: str | None = None) -> CalibratedRobot:
                 f"{run.folder}: there is no instrument '{name}'{proposal(name, list(instruments.placed))}"
             )
         placed = instruments.placed[name].robot
-        return placed if placed is not None and run.find(CALIBRATED) is None else instruments.seen_by(name, robot)
+        if placed is not None and run.find(CALIBRATED) is None:
+            return placed
+        beside = robot if run.find(CALIBRATED) is not None else leading_identification(instruments).robot
+        return instruments.seen_by(name, beside)
     seen = run.find(HAND_EYE)
     if robot is None and seen is not None:
         robot = seen.robot
@@ -221,7 +230,7 @@ STAGE = Stage(
     applies=lambda campaign: campaign.robot is not None and campaign.poses is not None and campaign.measures_robot,
     work=work,
     inputs=lambda campaign: [
-        p for p in campaign.files if p.suffix.lower() in {".csv", ".yaml", ".yml", ".urdf", ".xml"}
+        p for p in campaign.files if p.suffix.lower() in {".csv", ".yaml", ".yml", ".urdf", ".xml", ".py"}
     ],
     settings=lambda campaign: campaign.entry.model_dump(include=SETTINGS),
     after=("survey", "measure", "frames"),

@@ -11,7 +11,7 @@ from pipeline.json_io import read_json
 from pipeline.result_sections import noise_section, verification_section
 from pipeline.runs import Run
 from pipeline.stages.base import Context, Outcome, Stage, no_files
-from pipeline.stages.identify import load_calibrated, options_of, require_robot
+from pipeline.stages.identify import instruments_in_force, load_calibrated, options_of, require_robot
 from robcal.calibration.calibrated import CalibratedRobot
 from robcal.calibration.instruments import IdentifiedInstruments
 from robcal.calibration.measurements import RobotObservations
@@ -22,7 +22,8 @@ from robcal.files.poses_table import Poses
 from robcal.files.residual_table import residual_columns
 from robcal.files.robot_file import write_robot
 from robcal.files.tables import write_table
-from robcal.recipe.instruments import telling_verification, verify_instruments
+from robcal.recipe.agreement import disagreements
+from robcal.recipe.instruments import leading_identification, telling_verification, verify_instruments
 from robcal.recipe.noise import noise_of
 from robcal.recipe.verdict import robot_facts
 from robcal.recipe.verification import RobotVerification, approach_note, datum_note, verify_robot
@@ -41,7 +42,9 @@ def work(context: Context) -> Outcome:
     placed = run.find(artifacts.PLACED) if diagnosed else None
     delivered = run.find(artifacts.DELIVERED) if diagnosed else None
     options = options_of(campaign, identification.recording.stated)
-    instruments = run.find(artifacts.INSTRUMENTS)
+    instruments = instruments_in_force(run)
+    if instruments is not None:
+        identification = leading_identification(instruments)
     verified: dict[str, Verification] = {}
     try:
         if instruments is not None:
@@ -69,9 +72,10 @@ def work(context: Context) -> Outcome:
             "against the measurements as they are, those as recorded with the moves taken back"
         )
     diagnosis = read_json(run.diagnosis) if diagnosed and run.diagnosis.is_file() else None
-    judged = verdict(
-        robot_facts(identification, calibrated, poses, found.delivered, diagnosis, doubtful_coordinates(run))
-    )
+    recording = identification.recording
+    wrong = [] if instruments is not None else disagreements(found, calibrated, poses, recording, diagnosis)
+    doubts = doubtful_coordinates(run)
+    judged = verdict(robot_facts(identification, calibrated, poses, found.delivered, diagnosis, doubts, wrong))
     told = {"grade": judged.grade, "text": judged.text, "reasons": list(judged.reasons)}
     noise = noise_of(identification, calibrated, poses)
     result = {"verification": verification_section(found), "noise": noise_section(noise), "verdict": told}

@@ -30,7 +30,7 @@ def diagnosis_content(diagnosis: Diagnosis) -> dict[str, object]:
         "p_value": number(diagnosis.p_value),
         "statement": summary(diagnosis),
         "location": location,
-        "causes": [_cause(finding) for finding in diagnosis.findings],
+        "causes": [cause_content(finding) for finding in diagnosis.findings],
         "heldout_mm": {
             "before": number(diagnosis.heldout[0] * 1e3),
             "after": number(diagnosis.heldout[1] * 1e3),
@@ -58,7 +58,8 @@ def diagnosis_content(diagnosis: Diagnosis) -> dict[str, object]:
     }
 
 
-def _cause(finding: Finding) -> dict[str, object]:
+def cause_content(finding: Finding) -> dict[str, object]:
+    """One of the causes in diagnosis.json."""
     cause = finding.cause
     return {
         "cause": cause.name,

@@ -25,6 +25,7 @@ _DOUBTFUL = 0.2
 _DEFAULT = DetectionSettings()
 _ODD = (Reason.SHAPE, Reason.STRUCTURE, Reason.NO_CONVERGENCE, Reason.OVER_CAP)
 _CODED_MISFIT_MAX = 0.1
+_BASE_WRONG = 2.0  # step across the outline by the contrast against the coarse background
 _STEP_BY_CONTRAST = 0.4  # least step across the outline by the least contrast; small dots are all edge
 
 
@@ -48,7 +49,7 @@ def detect_targets(image: NDArray, settings: DetectionSettings = _DEFAULT) -> De
     Weakness: a lamp or reflection that is a clean ellipse within the size limits is reported as an uncoded dot; only
     geometry can decide later. Covariances hold for the centre of the dot's image ellipse, not for its eccentricity.
     """
-    _check(image)
+    check_image(image)
     noise = estimate_noise(image)
     log = RejectionLog()
     message = _nothing_to_see(image, noise, settings)
@@ -82,7 +83,8 @@ def detect_targets(image: NDArray, settings: DetectionSettings = _DEFAULT) -> De
     return result
 
 
-def _check(image: NDArray) -> None:
+def check_image(image: NDArray) -> None:
+    """Raise an error for what is no grey image of 8 or 16 bit, or too small."""
     if not isinstance(image, np.ndarray) or image.ndim != 2:
         raise InvalidInput("the image must be a two-dimensional grey array; convert colour to grey first")
     if image.dtype not in (np.uint8, np.uint16):
@@ -135,6 +137,9 @@ def _standing_out(
     high = step > _STEP_BY_CONTRAST * settings.min_contrast_sigma * np.sqrt(noise.at(candidates.base))
     for bad, reason in ((~around, Reason.SHAPE), (around & ~high, Reason.CONTRAST)):
         log.add_rows(candidates.xy[bad], candidates.semi_axes[bad, 0], reason)
+    # beside something bright the coarse background is far too high a start for the fit
+    wrong = step > _BASE_WRONG * (candidates.peak - candidates.base)
+    candidates = replace(candidates, base=np.where(wrong, candidates.peak - step, candidates.base))
     return candidates.select(around & high)
 
 

@@ -21,6 +21,8 @@ class TargetKind(IntEnum):
     DOT = 0
     RING12 = 1
     ARUCO = 2
+    CORNER = 3
+    CIRCLE = 4
 
 
 class CodeState(IntEnum):
@@ -45,6 +47,8 @@ class Reason(StrEnum):
     RING_PART = "segment of a code ring"
     DUPLICATE = "same blob as a better candidate"
     OVER_CAP = "over the cap on candidates"
+    CORNER = "no clean crossing of two edges (covered, reflection, too small)"
+    OFF_BOARD = "does not lie where the board has it"
 
 
 @dataclass(frozen=True)
@@ -70,14 +74,16 @@ class Detections:
     Attributes
     ----------
     shape : (height, width) of the image.
-    xy : (n, 2) centre of the dot's ellipse (ArUco: meeting point of the diagonals). Not corrected for eccentricity:
-        the centre of the ellipse is not the image of the dot's centre; axes and angle allow the correction later.
+    xy : (n, 2) centre of the dot's ellipse (ArUco: meeting point of the diagonals; corners: crossing of the edges).
+        Not corrected for eccentricity: the centre of the ellipse is not the image of the dot's centre; axes and angle
+        allow the correction later.
     covariance : (n, 2, 2) of the centre, px^2, from image noise and residuals.
-    semi_axes : (n, 2) semi-axes of the dot's edge, major first, px (ArUco: half of the mean side).
+    semi_axes : (n, 2) semi-axes of the dot's edge, major first, px (ArUco: half of the mean side; corners: reach of
+        the pixels used).
     angle : (n,) of the major axis, rad, from +x towards +y.
     contrast, background : (n,) grey values; contrast is negative for dark dots.
     saturated : (n,) bool, some of the dot's pixels are saturated.
-    code : (n,) ring12 id or marker id, -1 where there is none.
+    code : (n,) ring12 id, marker id or id on a board, -1 where there is none.
     kind : (n,) :class:`TargetKind`. code_state : (n,) :class:`CodeState`.
     blur : (n,) standard deviation of the edge profile, px, without the pixel's own 1/12.
     residual : (n,) RMS residual by contrast. chi2 : (n,) residual variance by the variance expected from noise.

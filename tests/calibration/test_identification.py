@@ -16,11 +16,11 @@ from robcal.calibration.observations import (
 from robcal.errors import InvalidInput, NotIdentifiable
 from robcal.robot.kernel import Kernel
 from robcal.robot.model import Term
-from tests.calibration.scenarios import scenario, tool_miss
+from tests.calibration.scenarios import Scenario, scenario, tool_miss
 from tests.robot.chains import kr_like
 
 
-def _points(s, sigma: float = 5e-5) -> PointObservations:  # type: ignore[no-untyped-def]
+def _points(s: Scenario, sigma: float = 5e-5) -> PointObservations:
     T = s.truth.frames(s.theta, s.poses)
     n = len(T)
     p = T[:, :3, 3] + sigma * s.rng.normal(size=(n, 3))

@@ -19,12 +19,13 @@ from robcal.calibration.problem import Evaluator
 from robcal.calibration.start_values import candidates, hand_eye
 from robcal.errors import NotIdentifiable
 from robcal.photogrammetry.core.camera import Camera, project
-from robcal.robot.kernel import Kernel
+from robcal.robot.kernel import Kernel, PoseInputs
 from robcal.robot.model import Frame, RobotModel
+from robcal.transforms import Array
 from tests.robot.chains import kr_like
 
 
-def _setup(seed: int = 0, n: int = 40):  # type: ignore[no-untyped-def]
+def _setup(seed: int = 0, n: int = 40) -> tuple[np.random.Generator, Kernel, PoseInputs, Array, Array, Array]:
     rng = np.random.default_rng(seed)
     kernel = Kernel(kr_like())
     poses = kernel.poses(rng.uniform(-1, 1, (n, 6)))

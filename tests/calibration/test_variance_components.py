@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from robcal.calibration.identification import IdentifyOptions
+from robcal.calibration.identification import IdentifiedRobot, IdentifyOptions
 from robcal.calibration.measurements import RobotRecording
 from robcal.calibration.observations import FrameObservations, PointObservations
 from robcal.calibration.variance_components import identify_recording
@@ -16,7 +16,9 @@ SIGMA, TURN = 5e-5, 1e-4
 POINTS = np.array([[0.2, 0.0, 0.05], [-0.15, 0.2, 0.0], [0.0, -0.2, 0.1]])
 
 
-def _identified(stated: float, *, points: bool = False, seed: int = 3):  # type: ignore[no-untyped-def]
+def _identified(
+    stated: float, *, points: bool = False, seed: int = 3
+) -> tuple[IdentifiedRobot, RobotRecording, float, float]:
     """A robot from frames (or three targets) whose stated sigmas are a factor off; the recording that was used; its
     mean error and its mean predicted sigma at kept-out poses, m."""
     s = scenario(seed, n=60)
@@ -40,7 +42,7 @@ def _identified(stated: float, *, points: bool = False, seed: int = 3):  # type:
 
 
 @pytest.mark.parametrize("points", [False, True])
-@pytest.mark.parametrize("stated", [0.05, 1.0, 20.0])
+@pytest.mark.parametrize("stated", [0.05, 1.0, 2.0, 20.0])
 def test_robot_and_its_uncertainty_do_not_depend_on_a_wrong_stated_sigma(stated: float, points: bool) -> None:
     right, _, least, _ = _identified(1.0, points=points)
     found, used, miss, sigma = _identified(stated, points=points)

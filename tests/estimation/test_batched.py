@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from robcal.estimation.batched import NormalEquations, minimise_each
@@ -9,7 +11,7 @@ from robcal.estimation.grouping import members
 from robcal.estimation.summary import TerminationSettings
 
 
-def _circles(points: np.ndarray, group: np.ndarray, n: int):  # type: ignore[no-untyped-def]
+def _circles(points: np.ndarray, group: np.ndarray, n: int) -> Callable[[np.ndarray, np.ndarray], NormalEquations]:
     """Normal equations of circles (centre, radius) through their own points."""
 
     def equations(x: np.ndarray, chosen: np.ndarray) -> NormalEquations:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
@@ -10,7 +12,9 @@ from robcal.estimation.gauss_newton import gauss_newton, solve_step
 from robcal.estimation.summary import TerminationSettings
 
 
-def _circle(points: np.ndarray):  # type: ignore[no-untyped-def]
+def _circle(
+    points: np.ndarray,
+) -> tuple[Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]], Callable[[np.ndarray], np.ndarray]]:
     def residuals(x: np.ndarray) -> np.ndarray:
         return x[2] * 0 - (np.hypot(points[:, 0] - x[0], points[:, 1] - x[1]) - x[2])
 

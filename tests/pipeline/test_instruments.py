@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,7 +23,7 @@ TURNS = [f"{end}.{kind}" for end in ("world_T_base", "flange_T_tool") for kind i
 
 
 @pytest.fixture(scope="module")
-def wires_and_tracker(tmp_path_factory):  # type: ignore[no-untyped-def]
+def wires_and_tracker(tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, Path]:
     """Two wires identify, a tracker verifies."""
     folder = tmp_path_factory.mktemp("wires")
     wire = Watcher("distances", poses="identify", sigma_mm=0.02)
@@ -32,7 +33,7 @@ def wires_and_tracker(tmp_path_factory):  # type: ignore[no-untyped-def]
     return made, folder
 
 
-def test_lengths_identify_and_frames_verify(wires_and_tracker) -> None:  # type: ignore[no-untyped-def]
+def test_lengths_identify_and_frames_verify(wires_and_tracker: tuple[Any, Path]) -> None:
     _, folder = wires_and_tracker
     result = json.loads((folder / "run" / "result.json").read_text())
     wire, tracker = result["instruments"]["left"], result["instruments"]["tracker"]
@@ -44,7 +45,7 @@ def test_lengths_identify_and_frames_verify(wires_and_tracker) -> None:  # type:
     assert tracker["verification"]["nominal"]["0"]["mean"] > 2.0
 
 
-def test_predictions_are_made_in_the_world_of_the_named_instrument(wires_and_tracker) -> None:  # type: ignore[no-untyped-def]
+def test_predictions_are_made_in_the_world_of_the_named_instrument(wires_and_tracker: tuple[Any, Path]) -> None:
     made, folder = wires_and_tracker
     poses, out = folder / "campaign" / "poses.csv", folder / "f.csv"
     predict_run(folder / "run", poses, out)

@@ -1,6 +1,7 @@
 """Faults of the joint log are named, with the fit after mending as proof."""
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -43,7 +44,9 @@ def exchanged(rows: Rows) -> None:
         (exchanged, ["joints 4 and 6 are exchanged"]),
     ],
 )
-def test_fault_is_named_with_proof(frame_campaign: Path, tmp_path: Path, fault, words: list[str]) -> None:
+def test_fault_is_named_with_proof(
+    frame_campaign: Path, tmp_path: Path, fault: Callable[[Rows], None], words: list[str]
+) -> None:
     edit_rows(frame_campaign / "poses.csv", fault)
     with pytest.raises(InvalidInput) as error:
         run_campaign(frame_campaign, tmp_path / "run", until="identify")
@@ -70,7 +73,7 @@ def exchanged_beyond_limits(rows: Rows) -> None:
     ],
 )
 def test_a_slip_that_leaves_the_ranges_is_named_as_well(
-    frame_campaign: Path, tmp_path: Path, fault, words: str
+    frame_campaign: Path, tmp_path: Path, fault: Callable[[Rows], None], words: str
 ) -> None:
     edit_rows(frame_campaign / "poses.csv", fault)
     with pytest.raises(InvalidInput, match="outside the range") as error:
@@ -179,7 +182,9 @@ def mirror(rows: Rows) -> None:
 
 
 @pytest.mark.parametrize(("fault", "words"), [(metres, ["0.001 times", "millimetres"]), (mirror, ["mirror image"])])
-def test_faults_of_all_points(point_campaign: Path, tmp_path: Path, fault, words: list[str]) -> None:  # type: ignore[no-untyped-def]
+def test_faults_of_all_points(
+    point_campaign: Path, tmp_path: Path, fault: Callable[[Rows], None], words: list[str]
+) -> None:
     edit_rows(point_campaign / "points.csv", fault)
     with pytest.raises(InvalidInput) as error:
         run_campaign(point_campaign, tmp_path / "run", until="identify")

@@ -20,7 +20,7 @@ PLACE = {"xyz_mm": [1400, 300, 600], "rpy_deg": [0, 0, 20]}
 SENSOR = {"xyz_mm": [50, 0, 300], "rpy_deg": [5, 10, 15]}
 
 
-def description(folder: Path, **changes) -> Path:  # type: ignore[no-untyped-def]
+def description(folder: Path, **changes: object) -> Path:
     data = yaml.safe_load((CONFIGS / "poses" / "kr150_sphere.yaml").read_text())
     data["robot"] = str(CONFIGS / "robots" / "kr150_class.yaml")
     data["body"] = str(CONFIGS / "bodies" / "sphere_200.yaml")
@@ -61,13 +61,13 @@ def seen_by_the_true_robot(out: Path, parameters: dict) -> tuple[np.ndarray, np.
 
 
 @pytest.fixture(scope="module")
-def nominal(tmp_path_factory):  # type: ignore[no-untyped-def]
+def nominal(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict, Path]:
     folder = tmp_path_factory.mktemp("sphere")
     out = folder / "poses.csv"
     return generate_poses(description(folder), out), out
 
 
-def test_poses_stand_square_at_the_distance(nominal) -> None:  # type: ignore[no-untyped-def]
+def test_poses_stand_square_at_the_distance(nominal: tuple[dict, Path]) -> None:
     answer, out = nominal
     tilt, miss = seen_by_the_true_robot(out, {})
     assert tilt.max() < 0.01
@@ -79,7 +79,7 @@ def test_poses_stand_square_at_the_distance(nominal) -> None:  # type: ignore[no
     assert len(counts) + len(answer["unreachable"]) == 42
 
 
-def test_free_turns_cover_joint_space(nominal) -> None:  # type: ignore[no-untyped-def]
+def test_free_turns_cover_joint_space(nominal: tuple[dict, Path]) -> None:
     table = read_table(nominal[1])
     assert np.ptp(table.numbers("turn_deg")) > 180
     assert np.ptp(table.numbers("q6_deg")) > 180
@@ -90,7 +90,7 @@ def test_free_turns_cover_joint_space(nominal) -> None:  # type: ignore[no-untyp
     assert steps.mean() < 0.7 * mixed.mean()
 
 
-def test_the_sphere_is_an_obstacle_for_the_links(nominal, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+def test_the_sphere_is_an_obstacle_for_the_links(nominal: tuple[dict, Path], tmp_path: Path) -> None:
     from pipeline.pose_generation import read_sensor_request
 
     request = read_sensor_request(description(tmp_path))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from typing import Any
 
 import numpy as np
 import pytest
@@ -57,7 +58,7 @@ def test_jacobians_agree_with_differences(statics: str, gravity_frame: str, seed
         np.testing.assert_allclose(Jq[:, :, k], (up - down) / 2e-6, atol=1e-7)
 
 
-def _pinocchio(model: RobotModel):  # type: ignore[no-untyped-def]
+def _pinocchio(model: RobotModel) -> Any:
     pin = pytest.importorskip("pinocchio")
     robot, parent = pin.Model(), 0
     robot.gravity.linear = np.array(model.gravity)

@@ -38,6 +38,7 @@ class Recording:
     common : (m_obs, 3 | 6, k) displacements of points or frames by one
         standard deviation of errors common to all poses (orientation of the station, coordinates of the body).
     own_station : measured by cameras whose own images are diagnosed: their moves are reported from those.
+    hidden : names of causes that these measurements cannot tell, so that none of them is named.
     """
 
     q: Array
@@ -50,6 +51,7 @@ class Recording:
     shared: SharedNoise | None = None
     common: Array | None = None
     own_station: bool = False
+    hidden: tuple[str, ...] = ()
 
     def linearise(self, frames: Array, J: Array) -> tuple[Array, Array]:
         """Whitened residuals (m,) and Jacobian (m, p) at modelled frames (n, 4, 4) with right twists (n, 6, p)."""

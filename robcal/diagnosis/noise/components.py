@@ -12,6 +12,9 @@ from robcal.diagnosis.core.recording import Recording
 from robcal.physics.cause import Array
 from robcal.robot.model import RobotModel
 
+SWALLOWED = 0.25
+"""Share of the stated variance below which single numbers are not believed to scatter."""
+
 
 @dataclass(frozen=True)
 class Noise:
@@ -66,7 +69,10 @@ def restricted_likelihood(present: Fit, recording: Recording, common: Array | No
         seen_zero = np.eye(shared, fitted + shared, fitted)
         blocks.append((np.zeros((shared, moved.shape[2])), np.zeros(shared), seen_zero))
     found = restricted_components(blocks)
+    # One number a pose hardly tells the joints' scatter from its own: where the joints swallow all of it, they have
+    # swallowed what is missing in the model.
+    swallowed = per == 1 and len(blocks) == observations and found.variance < SWALLOWED * min(1.0, found.alone)
     # below one the simpler model of the noise is taken
-    if found.statistic < 1.0:
+    if found.statistic < 1.0 or swallowed:
         return Noise(found.alone, 0.0, moved)
     return Noise(found.variance, float(np.sqrt(found.variance * found.ratio)), moved)

@@ -67,7 +67,13 @@ def library_at(fit: Fit, recording: Recording, at: Tangents, tied: frozenset[str
     present = {(a.cause.key, tuple(sorted(a.constants.items()))) for a in fit.accepted}
     single = {a.cause.key for a in fit.accepted if a.cause.acts_once}
     known = all_causes(site, at.data, recording.ids, recording.body)
-    named = [f for f in known if f.key not in single and not (recording.own_station and f.kind.moves == "camera")]
+    named = [
+        f
+        for f in known
+        if f.key not in single
+        and f.name not in recording.hidden
+        and not (recording.own_station and f.kind.moves == "camera")
+    ]
     empirical = list(empirical_causes(site)) if recording.observations_are_spatial else []
     return tuple(f for f in (*named, *empirical) if (f.key, tuple(sorted(f.grid[0].items()))) not in present)
 

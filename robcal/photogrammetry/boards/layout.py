@@ -149,6 +149,17 @@ class Board:
             return 2 if self.rows % 2 == 0 else 1
         return 1
 
+    @property
+    def same_when_turned(self) -> str:
+        """A sentence about boards that look the same when turned; empty for others."""
+        if self.turns == 1:
+            return ""
+        how = "half a turn" if self.turns == 2 else "a quarter turn"
+        return (
+            f"this {self.kind} board looks the same after {how}: images are numbered with the x axis to the right, so "
+            "do not turn the board before the camera by more than a fraction of that, or print one that is unambiguous"
+        )
+
     def ids(self) -> IntArray:
         """(t,) ids of the targets in the order of :meth:`points`."""
         return np.arange(len(self.points()), dtype=np.int64)

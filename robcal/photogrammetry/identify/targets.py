@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robcal.imaging.detections import Detections, TargetKind
+from robcal.photogrammetry.boards.layout import CIRCLE, CORNER
 from robcal.photogrammetry.core.bodies import Body, IntArray
 from robcal.photogrammetry.core.camera import Camera
 from robcal.photogrammetry.identify.dots import Dots
@@ -218,6 +219,8 @@ def coded_rows(detections: Detections, body: Body) -> tuple[IntArray, IntArray]:
     ok = np.zeros(len(code), dtype=bool)
     ok |= (detections.kind == TargetKind.RING12) & np.isin(code, body.ids[ring])
     ok |= (detections.kind == TargetKind.ARUCO) & np.isin(code, body.ids[marker])
+    for kind, name in ((TargetKind.CORNER, CORNER), (TargetKind.CIRCLE, CIRCLE)):
+        ok |= (detections.kind == kind) & np.isin(code, body.ids[np.array([c == name for c in body.codes], dtype=bool)])
     values, counts = np.unique(code[ok], return_counts=True)
     ok &= ~np.isin(code, values[counts > 1])
     rows = np.flatnonzero(ok)

@@ -167,6 +167,6 @@ def _columns(image: SurveyImage) -> _Columns:
     if image.detections is None:
         raise InvalidInput(f"image {image.name} has neither detections nor marks")
     found = image.detections
-    # a square marker shows no ellipse
-    angle = np.where(found.kind == TargetKind.ARUCO, np.nan, found.angle)
+    # a square marker or a corner shows no ellipse
+    angle = np.where(np.isin(found.kind, (TargetKind.ARUCO, TargetKind.CORNER)), np.nan, found.angle)
     return _Columns(image.name, found.xy, found.covariance, found.semi_axes, angle, found.code.astype(np.int64))

@@ -16,14 +16,14 @@ from robcal.calibration.measurements import RobotObservations, RobotRecording
 from robcal.calibration.observations import DistanceObservations, FrameObservations
 from robcal.calibration.problem import State
 from robcal.calibration.wire import LIMITS
-from tests.calibration.scenarios import scenario
+from tests.calibration.scenarios import Scenario, scenario
 
 GEOMETRY = IdentifyOptions(parameters="geometry")
 WIRE = tf.frame(np.eye(3), [-2.2, 1.4, -0.2])
 SIGMA, TURN = 5e-5, 1e-4
 
 
-def _log(s) -> JointLog:  # type: ignore[no-untyped-def]
+def _log(s: Scenario) -> JointLog:
     n = len(s.poses)
     names, load = list(s.model.payloads), s.poses.load
     payload = tuple(names[int(np.argmax(row))] if row.any() else None for row in load)
@@ -39,13 +39,13 @@ def _instrument(name: str, made: RobotObservations, **frames: CellFrame) -> Inst
     )
 
 
-def _frames(s, rng) -> FrameObservations:  # type: ignore[no-untyped-def]
+def _frames(s: Scenario, rng: np.random.Generator) -> FrameObservations:
     noise = rng.standard_normal((len(s.poses), 6)) * np.repeat([SIGMA, TURN], 3)
     moved = tf.retract(s.truth.frames(s.theta, s.poses), noise)
     return FrameObservations.isotropic(moved, SIGMA, TURN)
 
 
-def _lengths(s, rng) -> DistanceObservations:  # type: ignore[no-untyped-def]
+def _lengths(s: Scenario, rng: np.random.Generator) -> DistanceObservations:
     places = (WIRE @ tf.invert(s.truth.world_T_base) @ s.truth.frames(s.theta, s.poses))[:, :3, 3]
     n = len(places)
     d = np.linalg.norm(places, axis=1) + SIGMA * rng.standard_normal(n)

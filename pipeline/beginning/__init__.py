@@ -1,0 +1,1 @@
+"""The first campaign.yaml for a folder of recordings."""
