@@ -146,7 +146,11 @@ def iterate(
 
     used = windows.valid if dropped is None else windows.valid & ~dropped
     dots = Dots(
-        np.stack([windows.x, windows.y, windows.u, windows.v, windows.value]),
+        windows.x,
+        windows.y,
+        windows.u,
+        windows.v,
+        windows.value,
         used,
         windows.saturated,
         _last(used),

@@ -40,12 +40,16 @@ _BIAS, _SHIFT = np.int32(127), np.int32(23)
 class Dots(NamedTuple):
     """What n dots are fitted to, p pixels each.
 
-    `places` (5, n, p) x, y, u, v and grey value, single precision; `used`, `saturated` (n, p) bool, of which the first
-    `counts` (n,) pixels of a row are looked at; `is_spot` (n,); `priors` (n, 5) ln s, its precision, sigma of the
-    shading by the contrast, radius, number of pixels used.
+    `x`, `y`, `u`, `v`, `value` (n, p) places and grey values as in :class:`robcal.imaging.windows.Windows`; `used`,
+    `saturated` (n, p) bool, of which the first `counts` (n,) pixels of a row are looked at; `is_spot` (n,); `priors`
+    (n, 5) ln s, its precision, sigma of the shading by the contrast, radius, number of pixels used.
     """
 
-    places: Array32
+    x: Array32
+    y: Array32
+    u: Array32
+    v: Array32
+    value: Array32
     used: NDArray[np.bool_]
     saturated: NDArray[np.bool_]
     counts: NDArray[np.int64]
@@ -298,8 +302,13 @@ def minimise_all(dots, noise, rule, fits):  # type: ignore[no-untyped-def]
     for k in range(len(dots.counts)):
         count = dots.counts[k]
         for i in range(count):
-            for row in range(5):
-                pixels[row, i] = dots.places[row, k, i]
+            pixels[_X, i], pixels[_Y, i], pixels[_U, i], pixels[_V, i] = (
+                dots.x[k, i],
+                dots.y[k, i],
+                dots.u[k, i],
+                dots.v[k, i],
+            )
+            pixels[_VALUE, i] = dots.value[k, i]
             pixels[_PRECISION, i] = _1 if dots.used[k, i] else _0
             pixels[_SATURATED, i] = _1 if dots.saturated[k, i] else _0
         fits.converged[k] = _minimise(
