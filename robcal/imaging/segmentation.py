@@ -8,6 +8,7 @@ threshold of its own.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -183,7 +184,8 @@ def _has_far_too_many(above: NDArray[np.uint8]) -> bool:
 
 def _raised(image: NDArray, lift: int) -> NDArray:
     """The image plus a constant, cut off at the top of its range."""
-    return np.asarray(cv2.add(image, (min(lift, int(np.iinfo(image.dtype).max)), 0.0, 0.0, 0.0)), dtype=image.dtype)
+    constant: Any = (min(lift, int(np.iinfo(image.dtype).max)), 0.0, 0.0, 0.0)
+    return np.asarray(cv2.add(image, constant), dtype=image.dtype)
 
 
 def _finer_nodes(
