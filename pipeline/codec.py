@@ -11,6 +11,7 @@ import json
 import math
 import zipfile
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -70,6 +71,7 @@ def _class_name(cls: type) -> str:
     return f"{cls.__module__}:{cls.__qualname__}"
 
 
+@cache
 def _class(name: str) -> Any:
     module, _, path = name.partition(":")
     if not module.startswith(_MODULES):
@@ -80,6 +82,11 @@ def _class(name: str) -> Any:
     return target
 
 
+@cache
+def _member(name: str, value: int | str) -> Any:
+    return _class(name)(value)
+
+
 def decode(data: Any, arrays: Mapping[str, np.ndarray]) -> Any:
     """Inverse of :func:`encode`; arrays come back read-only."""
     if isinstance(data, list):
@@ -87,6 +94,8 @@ def decode(data: Any, arrays: Mapping[str, np.ndarray]) -> Any:
     if not isinstance(data, dict):
         return data
     kind = data["$"]
+    if kind == "enum" and isinstance(data["value"], int | str):  # thousands of reasons in an image
+        return _member(data["class"], data["value"])
     if kind == "array":
         array = arrays[data["key"]]
         array.setflags(write=False)

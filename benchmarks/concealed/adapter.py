@@ -75,17 +75,14 @@ def _frames(path: Path) -> Array:
 
 def library(folder: Path, tables: Mapping[str, Path]) -> Answer:
     """In this process: campaign reader, identification and diagnosis, without stages and reports."""
-    from pipeline.artifacts import body_for_robot
+    from pipeline.bodies import body_for_robot
     from pipeline.campaign import read_campaign
     from pipeline.runs import Run
     from pipeline.stages.identify import options_of, require_robot
     from pipeline.stages.observations import build_recording
-    from robcal.calibration.variance_components import identify_recording
     from robcal.diagnosis.content import diagnosis_content
-    from robcal.diagnosis.core.recording import Recording
-    from robcal.diagnosis.diagnose import diagnose
-    from robcal.recipe.robot_diagnosis import optional_parameters, own_elasticities
-    from robcal.robot.kernel import Kernel
+    from robcal.recipe.identification import identify_robot
+    from robcal.recipe.robot_diagnosis import Measured, diagnose_robot
 
     start = time.process_time()  # of this one core, whatever else runs on the machine
     campaign = read_campaign(folder)
@@ -93,38 +90,14 @@ def library(folder: Path, tables: Mapping[str, Path]) -> Answer:
     run = Run(folder.parent / "run")
     body = body_for_robot(campaign, run)
     measured = build_recording(campaign, run, body)
-    kernel = Kernel(robot, campaign.entry.model.statics)
-    rows = np.flatnonzero(~poses.verify)
-    found, measured = identify_recording(
-        robot, poses.inputs(kernel), measured, rows, options_of(campaign, measured.stated), kernel
-    )
-    covariates = poses.recorded()
-
-    def recording(chosen: Array) -> Recording | None:
-        if not len(chosen):
-            return None
-        return Recording(
-            poses.q[chosen],
-            tuple(poses.payload[i] for i in chosen),
-            {k: v[chosen] for k, v in covariates.items()},
-            tuple(poses.names[i] for i in chosen),
-            measured.select(chosen, detailed=True)[0],
-            *(() if body is None else (body.name, tuple(int(i) for i in body.ids))),
-        )
-
-    identify = recording(rows)
-    if identify is None:
+    found = identify_robot(robot, poses, measured, options_of(campaign, measured.stated))
+    outcome = diagnose_robot(found, poses, Measured(body))
+    if outcome is None:
         raise RuntimeError("no poses to identify from")
-    result = diagnose(
-        found.model,
-        identify,
-        found.names,
-        (*found.eliminated, *own_elasticities(found)),
-        recording(np.flatnonzero(poses.verify)),
-        optional=optional_parameters(found),
-    )
     seconds = time.process_time() - start
-    return Answer(diagnosis_content(result), _predicted(result.model, campaign, covariates, tables), seconds)
+    result = outcome.diagnosis
+    predicted = _predicted(result.model, campaign, poses.recorded(), tables)
+    return Answer(diagnosis_content(result), predicted, seconds)
 
 
 def _predicted(

@@ -22,6 +22,7 @@ from robcal.files.poses_table import Poses
 from robcal.files.residual_table import residual_columns
 from robcal.files.robot_file import write_robot
 from robcal.files.tables import write_table
+from robcal.recipe.agreement import disagreements
 from robcal.recipe.instruments import leading_identification, telling_verification, verify_instruments
 from robcal.recipe.noise import noise_of
 from robcal.recipe.verdict import robot_facts
@@ -71,9 +72,10 @@ def work(context: Context) -> Outcome:
             "against the measurements as they are, those as recorded with the moves taken back"
         )
     diagnosis = read_json(run.diagnosis) if diagnosed and run.diagnosis.is_file() else None
-    judged = verdict(
-        robot_facts(identification, calibrated, poses, found.delivered, diagnosis, doubtful_coordinates(run))
-    )
+    recording = identification.recording
+    wrong = [] if instruments is not None else disagreements(found, calibrated, poses, recording, diagnosis)
+    doubts = doubtful_coordinates(run)
+    judged = verdict(robot_facts(identification, calibrated, poses, found.delivered, diagnosis, doubts, wrong))
     told = {"grade": judged.grade, "text": judged.text, "reasons": list(judged.reasons)}
     noise = noise_of(identification, calibrated, poses)
     result = {"verification": verification_section(found), "noise": noise_section(noise), "verdict": told}

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy import stats
 
 from robcal.calibration.identification import IdentifiedRobot, IdentifyOptions, identify
 from robcal.calibration.measurements import RobotObservations, RobotRecording, Rows, rescaled
@@ -17,7 +18,10 @@ from robcal.robot.model import RobotModel
 from robcal.transforms import Array
 
 WRONG = 3.0
-"""Factor from which a stated sigma is not believed."""
+"""Factor from which lengths on the body refute a stated sigma that is too small."""
+LARGE = 0.7
+"""Share of a stated sigma below which residuals refute it, beyond chance: the model can only add to the noise."""
+LEVEL = 1e-4
 APART = 10.0
 """Factor from which residuals of positions and rotations refute what is stated of them."""
 FEWEST = 50
@@ -62,7 +66,7 @@ def believable(found: IdentifiedRobot, inputs: PoseInputs, recording: RobotRecor
     seen = [any(type(o) is type(kind) for o in used) for kind in recording.observations]
     lengths = _from_lengths(recording.select(rows, detailed=True))
     factors = [
-        _refuted(factor, lengths) if known and found.redundancy >= FEWEST else np.ones(len(factor))
+        _refuted(factor, found.redundancy, lengths) if known and found.redundancy >= FEWEST else np.ones(len(factor))
         for factor, known in zip(residual, seen, strict=True)
     ]
     if all(np.all(factor == 1.0) for factor in factors):
@@ -84,11 +88,12 @@ def believable(found: IdentifiedRobot, inputs: PoseInputs, recording: RobotRecor
     )
 
 
-def _refuted(residual: Array, lengths: float | None) -> Array:
+def _refuted(residual: Array, redundancy: int, lengths: float | None) -> Array:
     """Factors on the variances of one kind: ones where what is stated may be."""
     if len(residual) > 1 and not APART**-2 < residual[0] / residual[1] < APART**2:
         return residual
-    if np.all(residual < WRONG**-2):
+    # residuals below what is stated cannot be noise of that size, whatever else they hold
+    if np.all(residual < LARGE**2) and stats.chi2.cdf(float(np.mean(residual)) * redundancy, redundancy) < LEVEL:
         return residual
     if lengths is not None and lengths > WRONG**2:
         return np.full(len(residual), lengths)

@@ -44,6 +44,7 @@ class Facts:
     mirrored : what is a mirror image, in words.
     untested : coordinates that contradict what was measured, or that nothing measured tests, in words.
     coverage_95 : share of the kept-out poses inside their 95 % region; kept_out : their number.
+    disagreeing : results that contradict one another, in words.
     unexplained : the diagnosis finds structure that no cause explains; unnamed : part of the model has no name.
     """
 
@@ -59,6 +60,7 @@ class Facts:
     coverage_95: float | None = None
     kept_out: int = 0
     converged: bool = True
+    disagreeing: Sequence[str] = field(default=())
     unexplained: bool = False
     unnamed: bool = False
 
@@ -162,6 +164,7 @@ def _kept_out(f: Facts) -> str:
 RULES: tuple[Rule, ...] = (
     Rule("gain", "bad", _gain),
     Rule("mirrored", "bad", _mirror),
+    Rule("agreement", "bad", lambda f: "; ".join(f.disagreeing)),
     Rule("convergence", "bad", _convergence),
     Rule("sigma0", "care", _sigma0),
     Rule("before", "care", _before),

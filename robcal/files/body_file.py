@@ -112,14 +112,19 @@ def read_body(path: Path | str) -> BodyFile:
     return BodyFile(document.path, tuple(rows), entry.polarity or "bright", radius=radius)
 
 
-def _with_board(entry: BodyEntry, use: BoardEntry, document: YamlDocument, measured: list[BodyTargetRow]) -> BodyFile:
-    """The targets of a board's layout, those with measured coordinates there."""
+def board_of(use: BoardEntry, where: str) -> Board:
+    """The board that an entry states; ``where`` it stands, for messages."""
     mm = {name: getattr(use, f"{name}_mm") for name in ("square", "marker", "spacing", "diameter")}
     lengths = {name: None if value is None else value / 1000 for name, value in mm.items()}
     try:
-        board = Board(use.kind, use.columns, use.rows, dictionary=use.dictionary, **lengths)
+        return Board(use.kind, use.columns, use.rows, dictionary=use.dictionary, **lengths)
     except InvalidInput as error:
-        raise InvalidInput(f"{document.path}, line {document.line(('board',))}: {error}") from None
+        raise InvalidInput(f"{where}: {error}") from None
+
+
+def _with_board(entry: BodyEntry, use: BoardEntry, document: YamlDocument, measured: list[BodyTargetRow]) -> BodyFile:
+    """The targets of a board's layout, those with measured coordinates there."""
+    board = board_of(use, f"{document.path}, line {document.line(('board',))}")
     polarity = entry.polarity or "dark"
     body = board.body()
     rows = [

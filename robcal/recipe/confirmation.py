@@ -31,7 +31,8 @@ def confirmed(
     recording, rows : the poses that it was found in, and their rows in the joint log.
     extended : the robot with everything that was found.
     """
-    bound = {name for term in extended.model.terms if of_order(term) for name in term.parameter_names}
+    # what follows the order stays with the recording; curves with priors were accepted over folds, and share parts
+    bound = {n for term in extended.model.terms if of_order(term) or term.priors for n in term.parameter_names}
     groups = {str(k): f.names for k, f in enumerate(diagnosis.findings) if f.names and not bound.issuperset(f.names)}
     if not groups:
         return diagnosis, extended
@@ -85,3 +86,12 @@ def _with_force(finding: Finding, in_force: InForce, final: Fit) -> Finding:
         return replace(finding, waits=in_force.measuring)
     waits = next((in_force.waits[name] for name in finding.names if name in in_force.waits), "")
     return replace(finding, waits=waits) if waits else at_fit(finding, final)
+
+
+def unlike_table(findings: Sequence[Finding]) -> list[str]:
+    """Findings whose sentence quotes other numbers than their parameters."""
+    return [
+        f"the sentence '{finding.statement}' does not quote its parameters"
+        for finding in findings
+        if finding.cause.describe(finding.parameters) not in finding.statement
+    ]

@@ -6,6 +6,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
+import numpy as np
+
+from robcal.calibration.identifiability import repetitions
 from robcal.calibration.joint_log import JointLog
 from robcal.calibration.measurements import Rows
 from robcal.diagnosis.core.fitting import Accepted, Fit, fit
@@ -17,6 +20,9 @@ from robcal.transforms import Array
 
 Groups = Mapping[str, tuple[str, ...]]
 
+FEW = 60
+"""Different poses below which single ones are left out in place of blocks."""
+CURVES = "curves of the joints"
 MOVED_SHARE = 0.5
 """Moves of the station are taken back where at most this share of the error stays: else the robot would speak in a
 frame that only some of the poses vouch for."""
@@ -83,13 +89,17 @@ class Folds:
 
     @cached_property
     def labels(self) -> Array:
-        """Fold (n,) of each pose."""
-        return blocked_folds(self.recording)
+        """What each pose (n,) is left out with: its block or, of few poses, its repeats alone.
 
-    @property
+        A block of few poses leaves a robot behind that is far worse than the one to be judged.
+        """
+        alike = repetitions(self.recording.q)
+        return np.asarray(alike) if int(alike.max(initial=-1)) + 1 < FEW else blocked_folds(self.recording)
+
+    @cached_property
     def of_rows(self) -> Array:
-        """Fold (m,) of each observation."""
-        return self.labels[self.recording.observations.pose]
+        """Block (m,) of each observation, by which gains are judged."""
+        return blocked_folds(self.recording)[self.recording.observations.pose]
 
     def delivery(self, form: Form, given: JointLog, freed: bool = True) -> Delivery:
         """A form fitted, and predicted from a table of poses; `freed` of faults of the measuring system."""
@@ -156,22 +166,37 @@ def _with_terms(folds: Folds, base: Form, full: Form, groups: Groups) -> tuple[F
         pays = found.pays_beside(weighted)
         reasons.append(_told("terms of the robot", found, pays, weighted))
         part, unpaid = (trial, unpaid) if pays else (base, dict.fromkeys(groups, found))
+    waits: dict[str, str] = {}
     if unpaid and folds.log.inferred:
-        known = not_paying(folds.delivery(full, folds.log), groups, folds.of_rows)
-        waiting = [group for group in unpaid if group not in known]
-        trial = full.without([name for group in unpaid if group in known for name in groups[group]])
-        if waiting:
-            found, weighted = folds.gain(part, trial, folds.log)
-            cost, _ = folds.gain(part, trial, stated)
-            pays = found.pays_beside(weighted) and cost.even and cost.after <= WAITING * cost.before
-            words = f"terms of the robot, where approach directions are stated ({', '.join(waiting)}),"
-            reasons.append(_told(words, found, pays, weighted))
-            part = trial if pays else part
-            unpaid = {group: gain for group, gain in unpaid.items() if not pays or group in known}
-    if unpaid:
-        reasons.append(f"not in force, as they do not pay beside the others: {', '.join(unpaid)}")
-    why = {group: f"error over blocked folds {_errors(gain, 'it')}" for group, gain in unpaid.items()}
+        part, told, waits = _with_approach(folds, part, full, groups, unpaid)
+        reasons += told
+    unpaid = {group: gain for group, gain in unpaid.items() if not set(groups[group]) <= set(part.free)}
+    left = [group for group in unpaid if group not in waits]
+    if left:
+        reasons.append(f"not in force, as they do not pay beside the others: {', '.join(left)}")
+    why = {group: waits.get(group) or f"error over blocked folds {_errors(unpaid[group], 'it')}" for group in unpaid}
     return part, reasons, {name: why[group] for group in unpaid for name in groups[group]}
+
+
+def _with_approach(
+    folds: Folds, part: Form, full: Form, groups: Groups, unpaid: Mapping[str, Gain]
+) -> tuple[Form, list[str], dict[str, str]]:
+    """Terms that pay where the approach directions are known: in force if they cost nothing where they are not stated;
+    else they wait, by group why."""
+    known = not_paying(folds.delivery(full, folds.log), groups, folds.of_rows)
+    waiting = [group for group in unpaid if group not in known]
+    if not waiting:
+        return part, [], {}
+    trial = full.without([name for group in unpaid if group in known for name in groups[group]])
+    found, weighted = folds.gain(part, trial, folds.log)
+    if not found.pays_beside(weighted):
+        return part, [], {}
+    told = f"with approach directions stated the error over blocked folds is {_errors(found, 'them')}"
+    cost, _ = folds.gain(part, trial, folds.log.as_stated())
+    if cost.even and cost.after <= WAITING * cost.before:
+        return trial, [f"{', '.join(waiting)} pay: {told}"], {}
+    why = f"waits for approach directions: {told}, without directions {_errors(cost, 'them')}"
+    return part, [f"state approach: {', '.join(waiting)}: {told}"], dict.fromkeys(waiting, why)
 
 
 def _is_move(item: Accepted) -> bool:
@@ -179,7 +204,10 @@ def _is_move(item: Accepted) -> bool:
 
 
 def groups_of(bare: Form, extended: Form) -> Groups:
-    """What was added to a form, by name: the amplitudes of a term together, a parameter that was set free by itself."""
+    """What was added to a form, by name: the amplitudes of a term together, a parameter that was set free by itself.
+
+    Curves that their priors hold back were accepted together, over folds, and share parts: they stand or fall together.
+    """
     present = {name for term in bare.model.terms for name in term.parameter_names} | set(bare.free)
     groups: dict[str, tuple[str, ...]] = {}
     of_terms: set[str] = set()
@@ -187,7 +215,8 @@ def groups_of(bare: Form, extended: Form) -> Groups:
         names = tuple(name for name in term.parameter_names if name not in present)
         of_terms.update(term.parameter_names)
         if names:
-            groups[term.name] = tuple(dict.fromkeys((*groups.get(term.name, ()), *names)))
+            group = CURVES if term.priors else term.name
+            groups[group] = tuple(dict.fromkeys((*groups.get(group, ()), *names)))
     return groups | {name: (name,) for name in extended.free if name not in present | of_terms}
 
 

@@ -28,7 +28,7 @@ from robcal.photogrammetry.core.bodies import Body
 from robcal.photogrammetry.measure.measured_points import MeasuredPoints
 from robcal.photogrammetry.station.network import StationOrientation
 from robcal.physics.cause import DEVIATION, ObservationCause
-from robcal.recipe.confirmation import confirmed, with_force
+from robcal.recipe.confirmation import confirmed, unlike_table, with_force
 from robcal.recipe.evidence import Evidence, evidence_of
 from robcal.recipe.identification import Identification
 from robcal.recipe.image_findings import ImageFindings
@@ -168,10 +168,12 @@ def diagnose_robot(
         used = robot.used[kept]  # poses that the identification left out
         clean, rows = clean.subset(used), rows[used]
     delivered, relative, put, final = robot_in_force(found, log, clean, rows, in_force.form)
-    diagnosis = replace(diagnosis, findings=with_force(diagnosis.findings, in_force, final))
+    findings = with_force(diagnosis.findings, in_force, final)
+    diagnosis = replace(diagnosis, findings=findings, notes=(*diagnosis.notes, *unlike_table(findings)))
     if not in_force.diagnosed and not recording.own_station:
         delivered = found.robot  # as it was identified, so that nothing is worse than without a diagnosis
-    delivered = with_lack_of_fit(delivered, found, log, clean, rows, in_force.form)
+    least = estimate_noise(extended.model, clean, extended.free, extended.direct).factor
+    delivered = with_lack_of_fit(delivered, found, log, clean, rows, in_force.form, least)
     return RobotDiagnosis(
         diagnosis=diagnosis,
         recording=recording,
@@ -235,11 +237,18 @@ def robot_in_force(
 
 
 def with_lack_of_fit(
-    robot: CalibratedRobot, found: Identification, log: JointLog, recording: Recording, rows: Rows, form: Form
+    robot: CalibratedRobot,
+    found: Identification,
+    log: JointLog,
+    recording: Recording,
+    rows: Rows,
+    form: Form,
+    least: float,
 ) -> CalibratedRobot:
     """The robot with what poses kept out show beyond its parameters, beside what the measurement itself scatters by.
 
-    An own station's frames share errors that are told apart already.
+    An own station's frames share errors that are told apart already. ``least`` : factor on the stated variances that is
+    left with everything that was found and the recording knows, which bounds the measurement's.
     """
     if recording.own_station:
         return robot
@@ -248,7 +257,7 @@ def with_lack_of_fit(
     scale = noise.factor
     if parts.source != "none" and isinstance(recording.observations, FrameObservations | PointObservations):
         said = np.trace(recording.observations.covariance[:, :3, :3], axis1=1, axis2=2)
-        scale = float(parts.measurement**2 / np.mean(said))
+        scale = min(float(parts.measurement**2 / np.mean(said)), least)
     plain = replace(recording, common=None)
     fitted = form.fit(noise.apply(plain))
     inputs = log.as_stated().inputs(fitted.kernel).subset(rows)

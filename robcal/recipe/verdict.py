@@ -27,8 +27,10 @@ def robot_facts(
     verification: Verification,
     diagnosis: Mapping[str, Any] | None = None,
     untested: Sequence[str] = (),
+    disagreeing: Sequence[str] = (),
 ) -> Facts:
-    """Facts on the robot in force; ``diagnosis`` as in diagnosis.json, ``untested`` : doubts about coordinates."""
+    """Facts on the robot in force; ``diagnosis`` as in diagnosis.json, ``untested`` : doubts about coordinates,
+    ``disagreeing`` : results that contradict one another."""
     found = identification.robot
     diagnosis = diagnosis or {}
     p = (diagnosis.get("unexplained") or {}).get("p_value")
@@ -43,6 +45,7 @@ def robot_facts(
         geometry=_geometry(robot),
         negative=_negative(robot),
         untested=tuple(untested),
+        disagreeing=tuple(disagreeing),
         coverage_95=verification.coverage_95 if np.isfinite(verification.coverage_95) else None,
         kept_out=verification.poses,
         converged=found.summary.converged,

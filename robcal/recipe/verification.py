@@ -38,6 +38,7 @@ class RobotVerification:
         the measuring system), None where there is nothing of that.
     unstated : the same without the approach directions that were inferred; None where there are none.
     rows : (n,) rows of the poses in the joint log. notes : what was left out or assumed.
+    at_home : whether base and tool were fitted to these very poses, since nothing else tells them.
     """
 
     delivered: Verification
@@ -45,6 +46,7 @@ class RobotVerification:
     rows: Rows = field(repr=False)
     notes: tuple[str, ...] = ()
     unstated: Verification | None = None
+    at_home: bool = False
 
 
 def verify_robot(
@@ -120,7 +122,7 @@ def verify_robot(
             judged = {name: getattr(recorded, name) for name in ("normalised", "degrees", "p_value", "coverage_95")}
             outcome = replace(outcome, **judged)
             notes = [*notes, "uncertainties are judged without the faults of the measuring system that were found"]
-    return RobotVerification(outcome, recorded, kept_out, tuple(notes), unstated)
+    return RobotVerification(outcome, recorded, kept_out, tuple(notes), unstated, bool(foreign))
 
 
 def kept_out_gain(

@@ -42,7 +42,7 @@ def _identified(
 
 
 @pytest.mark.parametrize("points", [False, True])
-@pytest.mark.parametrize("stated", [0.05, 1.0, 20.0])
+@pytest.mark.parametrize("stated", [0.05, 1.0, 2.0, 20.0])
 def test_robot_and_its_uncertainty_do_not_depend_on_a_wrong_stated_sigma(stated: float, points: bool) -> None:
     right, _, least, _ = _identified(1.0, points=points)
     found, used, miss, sigma = _identified(stated, points=points)

@@ -21,6 +21,7 @@ SOUND = Facts(
 BROKEN = {
     "gain": ({"after_mm": 1.9}, "bad", "does not make this robot better"),
     "mirrored": ({"mirrored": ("the measured frames are",)}, "bad", "mirrored"),
+    "agreement": ({"disagreeing": ("the delivered error is 1 mm, what predict gives 2 mm",)}, "bad", "predict gives 2"),
     "convergence": ({"converged": False}, "bad", "did not converge"),
     "sigma0": ({"sigma0": 4.7}, "care", "4.7 times"),
     "before": ({"before_mm": 283.0}, "care", "missed by 283 mm"),

@@ -10,7 +10,7 @@ import pytest
 from robcal.diagnosis.core.fitting import Accepted, Fit, fit
 from robcal.diagnosis.core.recording import Recording
 from robcal.diagnosis.scan.tangents import Tangents, tangents
-from robcal.diagnosis.search.admissible import confounded_with, gains, possible, refusal
+from robcal.diagnosis.search.admissible import LEAST_FURTHER, confounded_with, fold_gain, possible, refusal
 from robcal.physics.cause import RobotCause
 from robcal.physics.library import all_causes
 from robcal.physics.site import RobotSite
@@ -71,5 +71,7 @@ def test_a_true_law_gains_on_blocks_and_noise_does_not() -> None:
     model = replace(MODEL, parameters={"axis3.elastic_pitch": 3e-6})
     poor = fit(model, recording, (*CELL, *FREE))
     rich = fit(model, recording, (*CELL, *FREE, "axis2.elastic_pitch"))
-    assert gains(poor, rich, recording)
-    assert not gains(rich, poor, recording)
+    gain, clear = fold_gain(poor, rich, recording)
+    assert clear
+    assert gain > LEAST_FURTHER
+    assert not fold_gain(rich, poor, recording)[1]

@@ -1,5 +1,7 @@
 """What is delivered of what was found: groups of terms, jumps that stay with the recording, scatter of the joints."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -38,6 +40,12 @@ def test_amplitudes_of_a_term_stand_or_fall_together() -> None:
     left = full.without(groups[WAVE.name])
     assert not left.model.terms
     assert left.free == ("axis1.yaw", "axis1.elastic_yaw")
+
+
+def test_curves_with_priors_stand_or_fall_together() -> None:
+    curves = [replace(WAVE, name=f"curve{k}", priors={"cos": 1e-5, "sin": 1e-5}) for k in range(2)]
+    bare, full = Form(model(), ()), Form(model(*curves), ())
+    assert [len(names) for names in groups_of(bare, full).values()] == [4]
 
 
 def test_scatter_of_the_joints_makes_up_the_excess_of_variance() -> None:

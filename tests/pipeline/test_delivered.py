@@ -1,14 +1,22 @@
 """The headline is what `predict` misses with the campaign's own table of poses, and the datum is that of the frames."""
 
+import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from fixtures.campaigns import make_campaign
+from pipeline.artifacts import IDENTIFICATION
+from pipeline.campaign import read_campaign
 from pipeline.prediction import predict_run
 from pipeline.runner import run_campaign
+from pipeline.runs import open_run
+from pipeline.stages.identify import load_calibrated
 from robcal.files.tables import read_table
+from robcal.recipe.agreement import disagreements
+from robcal.recipe.verification import verify_robot
 
 
 @pytest.mark.parametrize("level", ["frames", "points"])
@@ -32,3 +40,28 @@ def test_prediction_from_own_poses_misses_what_the_headline_says(tmp_path: Path,
     sigma = off["identify"].std(axis=0, ddof=1) / np.sqrt(len(off["identify"]))
     assert np.all(np.abs(off["identify"].mean(axis=0)) < 4 * sigma + 1e-6)
     assert isinstance(done.result["diagnosis"]["in_force"], bool)
+    diagnosis = json.loads((run / "diagnosis.json").read_text(encoding="utf-8"))
+    assert diagnosis["heldout_mm"]["after"] == pytest.approx(rms, rel=1e-3)
+    backlash = diagnosis["causes"][0]
+    assert backlash["in_force"] == diagnosis["in_force"]
+    assert ("not in force" in backlash["statement"]) != backlash["in_force"]
+    assert f"{backlash['parameters']['width_deg']:.4f}" in backlash["statement"]
+    assert not any("does not quote" in note for note in diagnosis["notes"])
+    assert "predict gives" not in " ".join(done.result["verdict"]["reasons"])
+
+
+def test_results_that_contradict_one_another_are_told(tmp_path: Path) -> None:
+    campaign, folder = tmp_path / "campaign", tmp_path / "run"
+    make_campaign(campaign, seed=7, level="frames", poses=40, verify=12)
+    run_campaign(campaign, folder, until="verify")
+    run, poses = open_run(folder), read_campaign(campaign).poses
+    assert poses is not None
+    identification, robot = run.load(IDENTIFICATION), load_calibrated(run)
+    found = verify_robot(robot.model, identification, robot, poses)
+    after = 1e3 * found.delivered.tools["0"].rms
+    told = {"heldout_mm": {"after": after}, "in_force": False, "causes": []}
+    assert disagreements(found, robot, poses, identification.recording, told) == []
+    wrong = {"heldout_mm": {"after": 0.9 * after}, "in_force": True, "causes": [{"cause": "x", "in_force": False}]}
+    assert len(disagreements(found, robot, poses, identification.recording, wrong)) == 2
+    other = replace(robot, model=robot.model.with_parameters({"axis2.x": 1e-3}))
+    assert "predict gives" in disagreements(found, other, poses, identification.recording)[0]

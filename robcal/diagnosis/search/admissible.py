@@ -21,16 +21,24 @@ RESTING = 1e-6
 """A joint that differs less than this (rad, m) from where it mostly is rests there."""
 LEAST_REST = 0.15
 """Share of the poses in which a joint must rest at one place for its setting out to be a pattern."""
+LEAST_FURTHER = 0.01
+"""Share by which a cause beside others has to lower the sum of squares over folds: half a percent of the error."""
 SURE = 2.0
 """Change of a fold's sum of squares, in units of the variance factor, that counts for or against a cause."""
 
 
 @dataclass(frozen=True)
 class Refusal:
-    """Why a cause that fits is not accepted; `confounded` if what else changed at its time explains it as well."""
+    """Why a cause that fits is not accepted.
+
+    Attributes
+    ----------
+    confounded : what else changed at its time explains it as well. small : the search has come to what matters no more.
+    """
 
     reason: str
     confounded: bool = False
+    small: bool = False
 
 
 def refusal(item: Accepted, before: Fit, after: Fit, at: Tangents) -> Refusal | None:
@@ -56,8 +64,15 @@ def refusal(item: Accepted, before: Fit, after: Fit, at: Tangents) -> Refusal | 
                 confounded=True,
             )
         return None
-    if not gains(before, after, at.recording):
+    gain, clear = fold_gain(before, after, at.recording)
+    if not clear:
         return Refusal(f"{cause.kind.words} at {cause.where} does not gain on blocks of poses that are kept out")
+    if before.accepted and gain < LEAST_FURTHER:
+        return Refusal(
+            f"{cause.kind.words} at {cause.where} would be next, but the mean square error over blocks of poses falls "
+            f"by {gain:.1%} only: the search ended there",
+            small=True,
+        )
     return None
 
 
@@ -106,12 +121,14 @@ def _settings(recording: Recording) -> Mapping[str, Array]:
     return out
 
 
-def gains(before: Fit, after: Fit, recording: Recording) -> bool:
-    """Whether most blocks of poses that say anything are predicted better by a fit to all others with the cause."""
+def fold_gain(before: Fit, after: Fit, recording: Recording) -> tuple[float, bool]:
+    """Share by which the sum of squares over blocked folds falls, and whether most blocks that say anything agree."""
     label = folds(recording)[before.row_pose]
-    change = _kept_out(before, label) - _kept_out(after, label)
+    left = _kept_out(before, label)
+    change = left - _kept_out(after, label)
     unit = SURE * after.variance_factor
-    return bool(change.sum() > 0 and np.sum(change > unit) >= np.sum(change < -unit))
+    clear = bool(change.sum() > 0 and np.sum(change > unit) >= np.sum(change < -unit))
+    return float(change.sum() / max(left.sum(), 1e-300)), clear
 
 
 def _kept_out(fitted: Fit, label: Array) -> Array:

@@ -224,6 +224,8 @@ def _extended(
                 return trial
             barred[added.cause.key] = reason.reason
             confounded += [trial.accepted[-1]] if reason.confounded else []
+            if reason.small:  # the most probable one comes first: the others gain less
+                return None
         else:
             barred[added.cause.key] = ""
     return None
