@@ -169,7 +169,7 @@ def _wrap(angle: Array) -> Array:
     return (angle + np.pi) % (2.0 * np.pi) - np.pi
 
 
-def read_rings(
+def read_rings(  # noqa: PLR0913 - columns of many dots
     image: NDArray,
     xy: Array,
     b: Array,
