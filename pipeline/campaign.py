@@ -326,7 +326,8 @@ class _Reader:
         stated = {"world_T_base": entry.world_T_base, "flange_T_tool": entry.flange_T_tool}
         for key in (k for k, v in stated.items() if v is not None and entry.instruments):
             raise self._error((key,), f"'{key}' serves a campaign with one instrument: state it at the instrument")
-        if not entry.instruments and not any(stated.values()):
+        loops = any(table.kind == "constraints" for table in measurements)
+        if not entry.instruments and not any(stated.values()) and not loops:
             return {}
         tables: dict[str, tuple[MeasuredTable, ...] | None] = {}
         if entry.station is not None:
