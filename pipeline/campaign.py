@@ -33,6 +33,7 @@ from robcal.files.robot_import import read_any_robot
 from robcal.files.schemas import parse, parse_leniently, proposal
 from robcal.files.tables import FaultyRows, Table, read_table
 from robcal.files.yaml_io import YamlDocument, read_yaml
+from robcal.photogrammetry.core.camera import Camera
 from robcal.physics.gravity_sag import without_masses
 from robcal.robot.chain import chain_of, forward
 from robcal.robot.model import RobotModel
@@ -325,7 +326,8 @@ class _Reader:
         stated = {"world_T_base": entry.world_T_base, "flange_T_tool": entry.flange_T_tool}
         for key in (k for k, v in stated.items() if v is not None and entry.instruments):
             raise self._error((key,), f"'{key}' serves a campaign with one instrument: state it at the instrument")
-        if not entry.instruments and not any(stated.values()):
+        loops = any(table.kind == "constraints" for table in measurements)
+        if not entry.instruments and not any(stated.values()) and not loops:
             return {}
         tables: dict[str, tuple[MeasuredTable, ...] | None] = {}
         if entry.station is not None:
@@ -475,6 +477,7 @@ class _Reader:
             return BodySource(file)
         place = ("bodies", name, "survey")
         source = self._source(use.survey, use.survey.camera, place, f"the survey of '{name}'")
+        self._brown(source, place)
         return BodySource(file, source, use.survey)
 
     def _source(
@@ -511,9 +514,19 @@ class _Reader:
 
     def _camera(self, name: str, use: StationCameraEntry, poses: Poses | None) -> ImageSource:
         source = self._source(use, use.calibration, ("station", "cameras", name), f"camera '{name}'")
+        self._brown(source, ("station", "cameras", name))
         if use.images is not None:
             source = replace(source, images=self._by_stem(source.images, name))
         return self._match_poses(source, name, poses)
+
+    def _brown(self, source: ImageSource, place: tuple[str | int, ...]) -> None:
+        """Refuse a lens that a survey or a station cannot adjust."""
+        if source.start is not None and type(source.start.camera) is not Camera:
+            raise self._error(
+                place,
+                f"{source.start_path}: surveys and stations adjust Brown's lens (k1, k2, p1, p2, k3): leave the "
+                "calibration out, the camera is then self-calibrated (other lenses serve a hand-eye calibration)",
+            )
 
     def _by_stem(self, images: Mapping[str, Path], camera: str) -> dict[str, Path]:
         stems: dict[str, Path] = {}

@@ -12,6 +12,8 @@ import typer
 from pipeline.cell_commands import cell
 from pipeline.command_line import CampaignPath, InstrumentName, Json, Quiet, RunFolder, Workers, answers, wrong_use
 from pipeline.drift_commands import app as drift_app
+from pipeline.fleet_commands import history, many
+from pipeline.live_commands import live_app
 from pipeline.mastering_commands import mastering
 from pipeline.messages import LOG
 from pipeline.program_commands import programs
@@ -28,6 +30,9 @@ app.add_typer(cell, name="cell")
 app.add_typer(drift_app, name="drift")
 app.add_typer(mastering)
 app.add_typer(programs)
+app.add_typer(many)
+app.add_typer(live_app)
+app.add_typer(history, name="history")
 
 RunOrDrift = Annotated[
     Path, typer.Argument(metavar="RUN", help="Run folder of a finished campaign, or state of a drift control.")
@@ -258,6 +263,39 @@ def poses(
         for sentence in answer["warnings"]:
             LOG.warning(sentence)
         LOG.info(f"{answer['poses']} poses in {out}")
+
+
+@app.command(short_help="Sheets of targets to print; or what can be read in images of them.")
+def targets(
+    config: Annotated[
+        Path | None, typer.Argument(metavar="CONFIG", help="What to print: YAML file of the format robcal/targets-1.")
+    ] = None,
+    images: Annotated[Path | None, typer.Option("--images", help="Folder of images to read targets in.")] = None,
+    body: Annotated[Path | None, typer.Option("--body", help="With --images: body file of what is to be seen.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", help="PDF to write; with --images a folder.")] = None,
+    quiet: Quiet = False,
+    as_json: Json = False,
+) -> None:
+    """Print targets: CONFIG --out sheet.pdf (a board, codes to cut out, a plate, a sphere), with its body file.
+
+    Look at targets: --images FOLDER --out FOLDER writes a picture of what was read and refused in each image, and why,
+    and a draft of the body file.
+    """
+    if (config is None) == (images is None) or out is None:
+        wrong_use("state either CONFIG --out sheet.pdf, or --images FOLDER --out FOLDER")
+    with answers("targets", as_json, quiet) as answer:
+        if config is not None:
+            from pipeline.sheets.sheets import make_sheet
+
+            answer.update(make_sheet(config, out))
+            LOG.info(f"{answer['targets']} targets on {out}, body file {answer['body']}")
+        elif images is not None:
+            from pipeline.sheets.reading import read_targets
+
+            answer.update(read_targets(images, out, body))
+            for row in answer["images"]:
+                LOG.info(f"{row['image']}: {len(row['codes'])} identified, {row['dots']} dots without code")
+            LOG.info(f"pictures in {out}" + (f", draft {answer['body']}" if "body" in answer else ""))
 
 
 @app.command(short_help="C99 and URDF of the calibrated robot.")

@@ -11,6 +11,7 @@ import json
 import math
 import zipfile
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -31,7 +32,7 @@ def encode(value: Any, arrays: dict[str, np.ndarray]) -> Any:
     """Plain JSON data of a value; arrays go into ``arrays`` by key."""
     if isinstance(value, enum.Enum):  # before str and int, which an enum may also be
         return {"$": "enum", "class": _class_name(type(value)), "value": encode(value.value, arrays)}
-    if value is None or isinstance(value, bool | str):
+    if value is None or (isinstance(value, bool | str | int) and not isinstance(value, np.generic)):
         return value
     if isinstance(value, np.ndarray):
         if value.dtype == object:
@@ -41,8 +42,6 @@ def encode(value: Any, arrays: dict[str, np.ndarray]) -> Any:
         return {"$": "array", "key": key}
     if isinstance(value, np.generic):
         return encode(value.item(), arrays)
-    if isinstance(value, int):
-        return value
     if isinstance(value, float):
         return value if math.isfinite(value) else {"$": "float", "value": repr(value)}
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
@@ -70,6 +69,7 @@ def _class_name(cls: type) -> str:
     return f"{cls.__module__}:{cls.__qualname__}"
 
 
+@cache
 def _class(name: str) -> Any:
     module, _, path = name.partition(":")
     if not module.startswith(_MODULES):
@@ -80,6 +80,11 @@ def _class(name: str) -> Any:
     return target
 
 
+@cache
+def _member(name: str, value: int | str) -> Any:
+    return _class(name)(value)
+
+
 def decode(data: Any, arrays: Mapping[str, np.ndarray]) -> Any:
     """Inverse of :func:`encode`; arrays come back read-only."""
     if isinstance(data, list):
@@ -87,6 +92,8 @@ def decode(data: Any, arrays: Mapping[str, np.ndarray]) -> Any:
     if not isinstance(data, dict):
         return data
     kind = data["$"]
+    if kind == "enum" and isinstance(data["value"], int | str):  # thousands of reasons in an image
+        return _member(data["class"], data["value"])
     if kind == "array":
         array = arrays[data["key"]]
         array.setflags(write=False)

@@ -20,7 +20,7 @@ B = TypeVar("B")
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
 
 
-def _begin_worker(parent: int) -> None:
+def begin_worker(parent: int) -> None:
     """One thread each, and no life after the parent's: a run killed with -9 leaves no worker behind."""
     import cv2
 
@@ -49,7 +49,7 @@ def in_processes(work: Callable[[A], B], items: Sequence[A], workers: int) -> It
     os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))  # read when a worker loads numpy
     try:
         with ProcessPoolExecutor(
-            workers, multiprocessing.get_context("spawn"), initializer=_begin_worker, initargs=(os.getpid(),)
+            workers, multiprocessing.get_context("spawn"), initializer=begin_worker, initargs=(os.getpid(),)
         ) as pool:
             try:
                 yield from pool.map(work, items)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.hand_eye_poses import write_views
 from pipeline.pose_schema import FORMAT, PosesEntry, metres
 from robcal.calibration.collision import Capsule, Obstacle, link_capsules
 from robcal.calibration.pose_candidates import Cell
@@ -36,8 +37,12 @@ def generate_poses(config: Path, out: Path) -> dict[str, Any]:
     ------
     InvalidInput : the description contradicts itself, or no pose of the cell can be measured.
     """
-    if read_entry(config, PosesEntry, FORMAT)[0].sensor is not None:
+    entry = read_entry(config, PosesEntry, FORMAT)[0]
+    if entry.sensor is not None:
         return _generate_sensor_poses(config, out)
+    if entry.hand_eye is not None:
+        model = _robot(entry, config)
+        return write_views(entry, config, out, model, _bodies(entry, config, model))
     request = read_request(config)
     try:
         plan = plan_poses(request)

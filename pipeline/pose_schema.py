@@ -116,6 +116,20 @@ class SensorPart(Entry):
     flange_T_sensor: PlacementEntry | None = None
 
 
+class HandEyePart(Entry):
+    """A hand-eye calibration: the ``run`` that is to become sharper, or camera, board, and where they are about."""
+
+    run: Text | None = None
+    camera: Text | None = None
+    board: Text | None = None
+    mounted: Literal["hand", "world"] = "hand"
+    distance_mm: tuple[Positive, Positive] | None = None
+    flange_T_camera: PlacementEntry | None = None
+    base_T_camera: PlacementEntry | None = None
+    base_T_board: PlacementEntry | None = None
+    flange_T_board: PlacementEntry | None = None
+
+
 class PosesEntry(Entry):
     """The whole file."""
 
@@ -126,6 +140,7 @@ class PosesEntry(Entry):
     world_T_base: PlacementEntry = PlacementEntry()
     body: Annotated[BodyPart | None, BeforeValidator(_targets_alone)] = None
     sensor: SensorPart | None = None
+    hand_eye: HandEyePart | None = None
     base_T_body: PlacementEntry | None = None
     cameras: dict[str, Text] = Field(default_factory=dict)
     visibility: VisibilityPart = VisibilityPart()

@@ -149,6 +149,36 @@ def transaction(place: Path | str, *, make: bool = False) -> Iterator[sa.Connect
                 file.parent.mkdir(parents=True, exist_ok=True)
             except OSError as error:
                 raise StorageError(f"{file.parent}: cannot be made: {error.strerror or error}") from None
+    with _transaction(url, name) as connection:
+        yield connection
+
+
+@contextmanager
+def database_transaction(place: str, what: str) -> Iterator[sa.Connection]:
+    """A transaction on a database of another kind (``what`` for messages), made where it is not there.
+
+    Raises
+    ------
+    StorageError : the database is locked, full, gone.
+    """
+    given = re.match(r"^[a-z]\w*(\+\w+)?:/", place)
+    url = place if place.startswith("sqlite:") else database_url(place)
+    if not given:
+        file = Path(place)
+        if file.is_dir():
+            raise InvalidInput(f"{file}: is a folder: name a file for the {what}")
+        try:
+            file.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise StorageError(f"{file.parent}: cannot be made: {error.strerror or error}") from None
+        url = f"sqlite:///{file.absolute()}"
+    with _transaction(url, sa.engine.make_url(url).render_as_string(hide_password=True)) as connection:
+        yield connection
+
+
+@contextmanager
+def _transaction(url: str, name: str) -> Iterator[sa.Connection]:
+    local = url.startswith("sqlite")
     arguments: dict[str, Any] = {"timeout": LOCK_SECONDS} if local else {"connect_timeout": LOCK_SECONDS}
     try:
         engine = sa.create_engine(url, poolclass=sa.NullPool, connect_args=arguments)

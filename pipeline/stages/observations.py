@@ -2,20 +2,27 @@
 
 from dataclasses import replace
 
+import numpy as np
+
 from pipeline.artifacts import FRAMES, POINTS
 from pipeline.bodies import body_for_robot, surveyed_or_given
-from pipeline.campaign import Campaign
+from pipeline.campaign import Campaign, InstrumentSource
 from pipeline.campaign_schema import InstrumentEntry
 from pipeline.correction import load_correction
 from pipeline.runs import Run
+from robcal.calibration.closed_loops import loop_observations
 from robcal.calibration.instruments import Instrument
+from robcal.calibration.instruments.loops import loop_frame, start_of_loops
 from robcal.calibration.measurements import RobotObservations, RobotRecording, frame_observations, used_points
 from robcal.calibration.observations import DistanceObservations, FrameObservations
 from robcal.calibration.wire import USUAL_TENSION, Wire
-from robcal.errors import InvalidInput
+from robcal.errors import DegenerateGeometry, InvalidInput
+from robcal.files.measurement_tables import MeasuredTable
 from robcal.files.recordings import observations_of
 from robcal.photogrammetry.core.bodies import Body
 from robcal.recipe.wires import Correction
+from robcal.robot.chain import chain_of, forward
+from robcal.transforms import Array
 
 
 def build_instruments(campaign: Campaign, run: Run) -> list[Instrument]:
@@ -27,6 +34,9 @@ def build_instruments(campaign: Campaign, run: Run) -> list[Instrument]:
     """
     out = []
     for name, source in campaign.instruments.items():
+        if source.tables and any(table.kind == "constraints" for table in source.tables):
+            out += _closed_loops(campaign, name, source)
+            continue
         if name == "station" or (name == "measurements" and campaign.entry.station is None):
             tables = () if name == "station" else campaign.measurements
             recording = build_recording(replace(campaign, measurements=tables), run, body_for_robot(campaign, run))
@@ -41,6 +51,48 @@ def build_instruments(campaign: Campaign, run: Run) -> list[Instrument]:
         wire = ("radius",) if pulley is not None and pulley.free == "radius" else ()
         out.append(Instrument(name, recording, source.world, source.tool, wire))
     return out
+
+
+def _closed_loops(campaign: Campaign, name: str, source: InstrumentSource) -> list[Instrument]:
+    """The closed loops of an instrument's tables, each with a world of its own, all with the same tool.
+
+    Raises
+    ------
+    InvalidInput : other measurements beside them, or no robot.
+    """
+    tables = source.tables or ()
+    robot, poses = campaign.robot, campaign.poses
+    if robot is None or poses is None or any(table.kind != "constraints" for table in tables):
+        raise InvalidInput(f"instrument '{name}': closed loops are an instrument of their own, of a robot with poses")
+    loops = [
+        (loop, loop_observations(kind, t.pose[rows], t.values[rows], np.sqrt(_variance(t)[rows])), kind)
+        for t in tables
+        for k, (loop, kind) in enumerate(t.loops.items())
+        if len(rows := np.flatnonzero(t.loop == k))
+    ]
+    flange = forward(chain_of(robot), poses.q)
+    try:
+        placed = start_of_loops([(kind, flange[o.pose]) for _, o, kind in loops], source.tool)
+    except DegenerateGeometry as error:
+        raise InvalidInput(f"{tables[0].path}: {error}: spread the poses of each constraint") from None
+    tool, worlds = placed
+    return [
+        Instrument(
+            f"{name}-{loop}",
+            RobotRecording((o,), (o,), True),
+            loop_frame(f"{name}-{loop}", kind, world),
+            tool,
+            (),
+            kind,
+        )
+        for (loop, o, kind), world in zip(loops, worlds, strict=True)
+    ]
+
+
+def _variance(table: MeasuredTable) -> Array:
+    if table.covariance is None:
+        raise InvalidInput(f"{table.path}: sigma_mm is missing: how well a closed loop holds must be known")
+    return table.covariance
 
 
 def _on_wire(made: RobotObservations, entry: InstrumentEntry | None) -> RobotObservations:

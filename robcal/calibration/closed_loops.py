@@ -8,12 +8,11 @@ robot's scale.
 """
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from robcal.calibration.observations import DistanceObservations, Observations, PointObservations, _Rows
+from robcal.calibration.observations import DistanceObservations, PointObservations
 from robcal.errors import InvalidInput
 from robcal.transforms import Array, frame, gram_schmidt_frame
 
@@ -21,20 +20,16 @@ KINDS = ("point", "plane", "length")
 
 
 @dataclass(frozen=True)
-class PlaneObservations(_Rows):
+class PlaneObservations(DistanceObservations):
     """The tool's origin at a known height over the world's x-y plane.
 
     Attributes
     ----------
-    pose : (m,); height, sigma : (m,) m.
+    pose : (m,); distance, sigma : (m,) m, of which the first is the height. wire : not used.
     """
 
-    height: Array
-    sigma: Array
-    dimension: ClassVar[int] = 1
-
     def __post_init__(self) -> None:
-        self._check({"height": (), "sigma": ()})
+        self._check({"distance": (), "sigma": ()})
         if np.any(self.sigma <= 0):
             raise InvalidInput("PlaneObservations: sigma must be above zero")
 
@@ -43,14 +38,12 @@ class PlaneObservations(_Rows):
         at = T[self.pose]
         B = np.zeros((len(at), 1, 6))
         B[:, 0, :3] = at[:, 2, :3]
-        return (self.height - at[:, 2, 3])[:, None], B
-
-    def noise(self, T: Array) -> Array:
-        """As given."""
-        return (self.sigma**2)[:, None, None]
+        return (self.distance - at[:, 2, 3])[:, None], B
 
 
-def loop_observations(kind: str, pose: ArrayLike, value: ArrayLike, sigma: ArrayLike) -> Observations:
+def loop_observations(
+    kind: str, pose: ArrayLike, value: ArrayLike, sigma: ArrayLike
+) -> PointObservations | DistanceObservations:
     """Observations of one closed loop in its own world.
 
     Parameters

@@ -76,7 +76,7 @@ def candidates(
             for W, x in _one_target(base_T_flange[o.pose], o.p_world, near):
                 for R in _orientations() if turn is None else [turn]:
                     out.append((W, tf.frame(R, x - R @ centre)))
-        elif isinstance(o, DistanceObservations) and len(o.pose) >= 4 and not out:
+        elif type(o) is DistanceObservations and len(o.pose) >= 4 and not out:
             out += _from_distances(base_T_flange[o.pose], o.distance)
     return out
 

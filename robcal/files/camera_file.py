@@ -14,6 +14,7 @@ from robcal.files.schemas import Entry, Number, Positive, read_entry, shown
 from robcal.files.storage import write_text
 from robcal.files.yaml_io import FlowMapping, yaml_text
 from robcal.photogrammetry.core.camera import INTRINSIC_NAMES, Camera
+from robcal.photogrammetry.core.lenses import FISHEYE_NAMES, RATIONAL_NAMES, FisheyeCamera, RationalCamera
 from robcal.transforms import Array
 
 FORMAT = "robcal/camera-1"
@@ -37,7 +38,7 @@ class CameraEntry(Entry):
     format: Literal["robcal/camera-1"]
     width: Side
     height: Side
-    model: Literal["opencv"] = "opencv"
+    model: Literal["opencv", "fisheye"] = "opencv"
     fx: Positive
     fy: Positive
     cx: Number
@@ -47,6 +48,13 @@ class CameraEntry(Entry):
     p1: Number = 0.0
     p2: Number = 0.0
     k3: Number = 0.0
+    k4: Number | None = None
+    k5: Number | None = None
+    k6: Number | None = None
+    s1: Number | None = None
+    s2: Number | None = None
+    s3: Number | None = None
+    s4: Number | None = None
     pixel_um: Positive | None = None
     world_T_camera: Placement | None = None
     flange_T_camera: Placement | None = None
@@ -84,11 +92,11 @@ def read_camera(path: Path | str) -> CameraFile:
     file, choice = split_choice(path)
     foreign = foreign_camera(file, choice)
     if foreign is not None:
-        _check(foreign, {name: str(file) for name in INTRINSIC_NAMES})
+        _check(foreign, {name: str(file) for name in foreign.names})
         return CameraFile(foreign)
     entry, document = read_entry(file, CameraEntry, FORMAT)
-    camera = Camera(entry.width, entry.height, **{name: getattr(entry, name) for name in INTRINSIC_NAMES})
-    _check(camera, {name: f"{file}, line {document.line((name,))}" for name in INTRINSIC_NAMES})
+    camera = _camera(entry, str(file))
+    _check(camera, {name: f"{file}, line {document.line((name,))}" for name in camera.names})
     return CameraFile(
         camera=camera,
         world_T_camera=entry.world_T_camera.matrix() if entry.world_T_camera else None,
@@ -97,6 +105,20 @@ def read_camera(path: Path | str) -> CameraFile:
         flange_T_camera=entry.flange_T_camera.matrix() if entry.flange_T_camera else None,
         base_T_camera=entry.base_T_camera.matrix() if entry.base_T_camera else None,
     )
+
+
+def _camera(entry: CameraEntry, file: str) -> Camera:
+    """The camera with the lens that its entries tell: fisheye, rational where it has more than Brown's terms."""
+    given = {name for name in (*RATIONAL_NAMES, "k4") if getattr(entry, name)}
+    kind: type[Camera] = Camera
+    if entry.model == "fisheye":
+        if extra := sorted(given - set(FISHEYE_NAMES)):
+            raise InvalidInput(f"{file}: a fisheye lens has k1 to k4 and no {', '.join(extra)}: remove them")
+        kind = FisheyeCamera
+    elif any(getattr(entry, name) is not None for name in RATIONAL_NAMES[len(INTRINSIC_NAMES) :]):
+        kind = RationalCamera
+    blank = kind(entry.width, entry.height, entry.fx, entry.fy, entry.cx, entry.cy)
+    return blank.with_vector([getattr(entry, name) or 0.0 for name in blank.names])
 
 
 def _check(camera: Camera, where: Mapping[str, str]) -> None:
@@ -125,8 +147,9 @@ def _check(camera: Camera, where: Mapping[str, str]) -> None:
 def write_camera(path: Path | str, content: CameraFile, comment: str = "") -> None:
     """Write a camera file atomically."""
     camera = content.camera
-    data: dict[str, Any] = {"format": FORMAT, "width": camera.width, "height": camera.height, "model": "opencv"}
-    data.update({name: float(getattr(camera, name)) for name in INTRINSIC_NAMES})
+    data: dict[str, Any] = {"format": FORMAT, "width": camera.width, "height": camera.height}
+    data["model"] = "fisheye" if isinstance(camera, FisheyeCamera) else "opencv"
+    data.update({name: float(getattr(camera, name)) for name in camera.names})
     if content.pixel_um is not None:
         data["pixel_um"] = float(content.pixel_um)
     for name in ("world_T_camera", "flange_T_camera", "base_T_camera"):

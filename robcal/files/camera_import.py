@@ -18,6 +18,7 @@ from robcal.errors import InvalidInput
 from robcal.files.storage import read_bytes
 from robcal.files.yaml_io import read_yaml
 from robcal.photogrammetry.core.camera import Camera
+from robcal.photogrammetry.core.lenses import FisheyeCamera, RationalCamera
 from robcal.transforms import Array
 
 _MAX_BYTES = 1_000_000
@@ -26,6 +27,7 @@ _HEIGHT = ("imageheight", "height")
 _SIZE = ("imagesize", "resolution", "size")
 _MATRIX = ("cameramatrix", "intrinsicmatrix", "intrinsics", "k", "mtx", "m")
 _DISTORTION = ("distortioncoefficients", "distortioncoeffs", "distcoeffs", "distortion", "d", "dist")
+_FISHEYE = {"equidistant", "equi", "fisheye", "kannalabrandt4", "pinholeequi"}
 _BROWN = {"", "plumbbob", "radtan", "rationalpolynomial", "pinhole", "brown", "opencv"}
 
 
@@ -106,17 +108,26 @@ def _from_entries(path: Path, data: Mapping[str, Any]) -> Camera:
     else:
         raise InvalidInput(f"{path}: no camera matrix (3 x 3, or the four numbers fx, fy, cx, cy)")
     model = _plain(str(first(("distortionmodel", "cameramodel")) or ""))
-    if model not in _BROWN or entries.get("fisheyemodel"):
+    width, height = int(size[0]), int(size[1])
+    start = (width, height, 1.0, 1.0, 0.0, 0.0)
+    if model in _FISHEYE or entries.get("fisheyemodel"):
+        if D.size not in (0, 4):
+            raise InvalidInput(f"{path}: a fisheye lens has four coefficients (k1 to k4), found {D.size}")
+        return FisheyeCamera(*start).with_vector([fx, fy, cx, cy, *np.append(D, np.zeros(4 - D.size))])
+    if model not in _BROWN:
         raise InvalidInput(
-            f"{path}: lens model '{model}' is not Brown's (k1, k2, p1, p2, k3): calibrate with OpenCV's standard model "
-            "(ROS plumb_bob, Kalibr pinhole-radtan), or leave the start values out: the camera is then self-calibrated"
+            f"{path}: lens model '{model}' has no counterpart here: calibrate with OpenCV's standard or fisheye model "
+            "(ROS plumb_bob, rational_polynomial, equidistant; Kalibr pinhole-radtan, pinhole-equi), or leave the "
+            "start values out: the camera is then self-calibrated"
         )
-    if np.any(D[5:] != 0.0):
+    if np.any(D[12:] != 0.0):
         raise InvalidInput(
-            f"{path}: has {D.size} distortion coefficients; only k1, k2, p1, p2, k3 have a counterpart here: calibrate "
-            "with five, or leave the start values out"
+            f"{path}: has {D.size} distortion coefficients; a tilted sensor (tau) has no counterpart here: calibrate "
+            "without CALIB_TILTED_MODEL"
         )
-    return Camera(int(size[0]), int(size[1]), *map(float, (fx, fy, cx, cy, *D[:5])))
+    kind, most = (RationalCamera, 12) if np.any(D[5:] != 0.0) else (Camera, 5)
+    coefficients = np.append(D[:most], np.zeros(max(0, most - D.size)))
+    return kind(*start).with_vector([fx, fy, cx, cy, *coefficients])
 
 
 def _numbers(path: Path, value: Any, what: str) -> Array:

@@ -8,6 +8,8 @@ from typing import Any
 import cv2
 import numpy as np
 
+from robcal.errors import InvalidInput
+from robcal.files.camera_export import EXPORTS
 from robcal.files.storage import write_text
 from robcal.photogrammetry.core.camera import Camera
 from robcal.transforms import Array, xyzrpy_from_frame
@@ -75,6 +77,12 @@ def write_exports(folder: Path, camera_name: str, camera: Camera, frames: list[N
     paths = []
     for name, text in files.items():
         write_text(folder / name, text)
+        paths.append(folder / name)
+    for name, write in EXPORTS.values():
+        try:
+            write_text(folder / name, write(camera, camera_name))
+        except InvalidInput:
+            continue  # that program has no such lens; the command for it says so
         paths.append(folder / name)
     return paths
 

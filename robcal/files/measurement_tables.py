@@ -4,7 +4,7 @@ The kind of a table is told by its columns. Everything is converted to metres an
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -13,12 +13,13 @@ from numpy.typing import NDArray
 
 from robcal.calibration.recording_errors import empty_readings, frozen_readings
 from robcal.errors import InvalidInput
+from robcal.files.constraints import read_constraints
 from robcal.files.frame_tables import SIX, frame_covariance_columns, twist_covariance
 from robcal.files.tables import Table, read_table
 from robcal.transforms import Array, frame_from_xyzrpy
 
 IntArray = NDArray[np.int64]
-Kind = Literal["points", "frames", "distances", "sensor_points"]
+Kind = Literal["points", "frames", "distances", "sensor_points", "constraints"]
 
 MAX_METRES = 10_000.0
 MOST_OUTSIDE = 0.2
@@ -37,6 +38,7 @@ class MeasuredTable:
     covariance : (m, 3, 3), (m, 6, 6) (right perturbation of the frame) or (m,) variances; None if not stated.
     covariates : further numeric columns that belong to the single measurement (``cycle``, ``time_s``).
     angles : (m, 3) of frames as they stand in the file, rad.
+    loops : kinds of closed loops by name; ``loop`` : (m,) which of them, in that order.
     """
 
     kind: Kind
@@ -49,6 +51,8 @@ class MeasuredTable:
     covariates: Mapping[str, Array]
     notes: tuple[str, ...] = ()
     angles: Array | None = None
+    loops: Mapping[str, str] = field(default_factory=dict)
+    loop: IntArray | None = None
 
     def __len__(self) -> int:
         return len(self.pose)
@@ -68,6 +72,7 @@ class MeasuredTable:
             covariates={name: values[kept] for name, values in self.covariates.items()},
             notes=(*self.notes, note),
             angles=None if self.angles is None else self.angles[kept],
+            loop=None if self.loop is None else self.loop[kept],
         )
 
 
@@ -100,6 +105,8 @@ def measurements_of(table: Table, pose_names: Sequence[str], kind: Kind | None =
     """The measurements of a table, as :func:`read_measurements` does it."""
     path = table.path
     kind = kind or _kind(table)
+    if kind == "constraints":
+        return _constraints(table, pose_names)
     needed = {
         "points": ["pose", "target", "x_mm", "y_mm", "z_mm"],
         "sensor_points": ["pose", "target", "x_mm", "y_mm", "z_mm"],
@@ -131,6 +138,17 @@ def measurements_of(table: Table, pose_names: Sequence[str], kind: Kind | None =
     return _without_empty(measured, pose_names)
 
 
+def _constraints(table: Table, pose_names: Sequence[str]) -> MeasuredTable:
+    if not len(table):
+        raise InvalidInput(f"{table.path}: lists no constraints")
+    number, kinds, values, variance = read_constraints(table)
+    pose, notes = _pose_index(table, pose_names)
+    none = np.full(len(table), -1, dtype=np.int64)
+    return MeasuredTable(
+        "constraints", table.path, pose, table.rows, none, values, variance, {}, tuple(notes), None, kinds, number
+    )
+
+
 def _without_empty(table: MeasuredTable, pose_names: Sequence[str]) -> MeasuredTable:
     """Without rows of zeros or sentinels, which programs write where they measured nothing.
 
@@ -153,7 +171,7 @@ def _without_empty(table: MeasuredTable, pose_names: Sequence[str]) -> MeasuredT
 def without_frozen(table: MeasuredTable, places: Array, pose_names: Sequence[str]) -> MeasuredTable:
     """Without readings that stand still while the nominal flange moves on; ``places`` (n, 3) at the poses, m."""
     frozen = np.zeros(len(table), dtype=bool)
-    if table.kind == "sensor_points":
+    if table.kind in ("sensor_points", "constraints"):
         return table
     values = table.values[:, :3].reshape(len(table), -1) if table.kind == "frames" else table.values
     for target in np.unique(table.target):
@@ -170,6 +188,8 @@ def without_frozen(table: MeasuredTable, places: Array, pose_names: Sequence[str
 
 
 def _kind(table: Table) -> Kind:
+    if table.has("constraint"):
+        return "constraints"
     if table.has("distance_mm"):
         return "distances"
     if table.has("roll_deg") or table.has("pitch_deg") or table.has("yaw_deg"):
@@ -180,7 +200,8 @@ def _kind(table: Table) -> Kind:
     table.require(["pose"])
     raise InvalidInput(
         f"{table.path}, row 1: the columns are of no known kind: points need pose, target, x_mm, y_mm, z_mm; frames "
-        "pose, x_mm, y_mm, z_mm, roll_deg, pitch_deg, yaw_deg; distances pose, distance_mm"
+        "pose, x_mm, y_mm, z_mm, roll_deg, pitch_deg, yaw_deg; distances pose, distance_mm; closed loops pose, "
+        "constraint, kind, value_mm, sigma_mm"
     )
 
 

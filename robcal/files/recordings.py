@@ -68,6 +68,8 @@ def observations_of(table: MeasuredTable, body: Body | None) -> RobotObservation
     if table.kind == "distances":
         sigma = np.full(len(table), ASSUMED_SIGMA) if table.covariance is None else np.sqrt(table.covariance)
         return DistanceObservations(table.pose, table.values, sigma)
+    if table.kind == "constraints":
+        raise InvalidInput(f"{table.path}: closed loops have worlds of their own: list the table in a campaign")
     covariance = table.covariance
     if covariance is None:
         covariance = np.broadcast_to(ASSUMED_SIGMA**2 * np.eye(3), (len(table), 3, 3))

@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from robcal.calibration.calibrated import CalibratedRobot
+from robcal.calibration.closed_loops import PlaneObservations
 from robcal.calibration.measurements import RobotObservations
 from robcal.calibration.observations import (
     DistanceObservations,
@@ -18,6 +19,7 @@ _KINDS: Mapping[type, str] = {
     FrameObservations: "frame",
     PointObservations: "point",
     DistanceObservations: "distance",
+    PlaneObservations: "height",
     SensorPointObservations: "sensor_point",
 }
 

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from robcal.estimation.summary import TerminationSettings
 from robcal.handeye.closed_form import image_errors
 from robcal.handeye.data import BoolArray, HandEyeData
 from robcal.handeye.fit import Fit, mean_by_image
@@ -13,6 +14,8 @@ from robcal.photogrammetry.core.bodies import IntArray
 from robcal.transforms import Array
 
 FOLDS = 6
+NEAR = TerminationSettings(3, 6, 1e-6)
+"""A fold is solved from the solution with all images, next to its own."""
 
 
 def rejected(
@@ -72,7 +75,7 @@ def held_out(fit: Fit, used: BoolArray, kept_out: BoolArray) -> HeldOut | None:
     for fold in range(folds):
         out = np.isin(data.image, order[fold::folds])
         problem = replace(fit.problem, used=fit.problem.used & ~out)
-        again = replace(fit, problem=problem, solved=problem.solve(fit.solved.state, fit.solved.variances))
+        again = replace(fit, problem=problem, solved=problem.solve(fit.solved.state, fit.solved.variances, NEAR))
         mine = out & fit.problem.used
         px.append(np.sum(again.pixels() ** 2, axis=1)[mine])
         mm.append(again.millimetres()[mine])

@@ -13,8 +13,9 @@ from robcal.handeye.unknowns import Variances
 from robcal.photogrammetry.core.bodies import IntArray
 from robcal.transforms import Array
 
-SHAPE_LIMITS = {1: 9.0, 3: 16.3}
-"""Chi-square from which on one deviation of the board counts, or three together: one exact board in 400, in 1000."""
+SHAPE_LIMITS = {1: 16.0, 3: 22.0}
+"""Chi-square from which on one deviation of the board counts, or three together: less than one exact board in 10 000.
+A scale that is taken up by mistake costs more than many small ones that are not."""
 ROBOT_GAIN = 12.0
 """Twice the log likelihood that two further variance components, those of the robot's geometry, must gain."""
 MOVE_SIGMAS = 6.0

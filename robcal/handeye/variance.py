@@ -18,6 +18,8 @@ LEAST_PLACE, MOST_PLACE = 1e-7, 0.5
 LEAST_TURN, MOST_TURN = 1e-7, 0.5
 LEAST_PIXEL, MOST_PIXEL = 1e-3, 1e3
 SINGULAR = 1e12
+END = {"maxiter": 60, "ftol": 1e-8, "gtol": 0.05}
+"""The criterion is curved by hundreds a unit of a logarithm: a slope below this is a ten thousandth of a component."""
 NEGLIGIBLE = 3e-7
 """Components (m, rad) below this are none."""
 
@@ -66,7 +68,7 @@ def estimate(system: System, start: Variances, wide: bool = True) -> tuple[Varia
         guess = np.array([getattr(start, name) * (1.0 if name == "pixel" else share) for name in names])
         first = np.clip(np.log(np.maximum(guess, np.exp(limits[:, 0]))), limits[:, 0] + 1.0, limits[:, 1])
         found = optimize.minimize(
-            lambda logs: criterion(system, of(logs)), first, method="L-BFGS-B", bounds=limits, options={"maxiter": 60}
+            lambda logs: criterion(system, of(logs)), first, method="L-BFGS-B", bounds=limits, options=END
         )
         if best is None or found.fun < best[0]:
             best = (float(found.fun), np.asarray(found.x))

@@ -33,31 +33,23 @@ _SETTINGS = TerminationSettings(max_iterations=25, cost_tolerance=1e-7, negligib
 
 @dataclass(frozen=True)
 class CornerWindows(Columns):
-    """Pixels around n corners, squares of (2 h + 1) pixels a side.
+    """Pixels around n corners, p each, row by row, padded.
 
     Attributes
     ----------
-    origin : (n, 2) pixel in the middle. value : (n, p) grey values. valid : (n, p) pixels that show this corner alone.
-    saturated : (n, p). curvature : (n, 2) of both edges, 1/px. half : h.
+    origin : (n, 2) pixel in the middle. x, y, value : (n, p) place from the origin, px, and grey value.
+    valid : (n, p) pixels that show this corner alone. saturated : (n, p). curvature : (n, 2) of both edges, 1/px.
+    half : half width of the windows, px.
     """
 
     origin: Array
+    x: Array
+    y: Array
     value: Array
     valid: NDArray[np.bool_]
     saturated: NDArray[np.bool_]
     curvature: Array
-    half: int
-
-    @property
-    def side(self) -> int:
-        """Pixels along a side."""
-        return 2 * self.half + 1
-
-    def places(self) -> tuple[Array, Array]:
-        """x, y (p,) of the pixels from the origin."""
-        offset = np.arange(-self.half, self.half + 1.0)
-        x, y = np.meshgrid(offset, offset)
-        return x.ravel(), y.ravel()
+    half: float
 
 
 @dataclass(frozen=True)
@@ -94,13 +86,12 @@ class _State(Columns):
 
 def model_values(parameters: Array, windows: CornerWindows) -> tuple[Array, Array]:
     """Grey values (n, p) and derivatives (n, 11, p)."""
-    x, y = windows.places()
-    px, py = (np.broadcast_to(v, windows.value.shape) for v in (x, y))
-    profile, by_shape = blurred_corner(parameters[:, :SHAPE_PARAMETERS], windows.curvature, px, py)
+    x, y = windows.x, windows.y
+    profile, by_shape = blurred_corner(parameters[:, :SHAPE_PARAMETERS], windows.curvature, x, y)
     u, v = x / windows.half, y / windows.half
     b0, b1, b2, a0, a1, a2 = (parameters[:, SHAPE_PARAMETERS + k, None] for k in range(6))
     amplitude = a0 + a1 * u + a2 * v
-    jacobian = np.empty((len(parameters), PARAMETERS, len(x)))
+    jacobian = np.empty((len(parameters), PARAMETERS, x.shape[1]))
     jacobian[:, :SHAPE_PARAMETERS] = by_shape * amplitude[:, None]
     jacobian[:, 5], jacobian[:, 6], jacobian[:, 7] = 1.0, u, v
     jacobian[:, 8] = profile
@@ -156,9 +147,7 @@ def fit_corners(
 
 def _levels(windows: CornerWindows, start: Array) -> tuple[Array, Array]:
     """Mean level and signed amplitude (n,) from the means where f is clearly positive and negative."""
-    x, y = windows.places()
-    px, py = (np.broadcast_to(v, windows.value.shape) for v in (x, y))
-    profile, _ = blurred_corner(start, windows.curvature, px, py)
+    profile, _ = blurred_corner(start, windows.curvature, windows.x, windows.y)
 
     def mean(chosen: NDArray[np.bool_]) -> Array:
         count = chosen.sum(axis=1)
@@ -239,11 +228,10 @@ def _seen_noise(state: _State, noise: NoiseModel, windows: CornerWindows) -> tup
     if clean.sum() < 8:
         return noise, 1.0
     factor = float(np.median(chi2[clean]))
-    side = windows.side
-    normalised = np.clip(state.residual * np.sqrt(state.precision), -4.0, 4.0)[clean].reshape(-1, side, side)
-    used = (state.precision[clean] > 0).reshape(-1, side, side)
-    pair = used[:, :, 1:] & used[:, :, :-1]
-    left, right = normalised[:, :, 1:], normalised[:, :, :-1]
+    normalised = np.clip(state.residual * np.sqrt(state.precision), -4.0, 4.0)
+    used = (state.precision > 0) & clean[:, None]
+    pair = used[:, 1:] & used[:, :-1] & (np.diff(windows.x, axis=1) == 1) & (np.diff(windows.y, axis=1) == 0)
+    left, right = normalised[:, 1:], normalised[:, :-1]
     squares = 0.5 * ((left**2 + right**2) * pair).sum()
     lag_one = float((left * right * pair).sum() / max(squares, 1e-12))
     seen = replace(noise, variance=noise.variance * factor, gain=noise.gain * factor)

@@ -11,6 +11,7 @@ the fit's window.
 """
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,9 @@ from robcal.columns import Columns
 from robcal.imaging.edge_model import SHAPE_PARAMETERS, blurred_ellipse, profile_only, spot
 from robcal.imaging.noise import NoiseModel
 from robcal.imaging.windows import Windows
+
+if TYPE_CHECKING:
+    from robcal.imaging.ellipse_loop import Dots
 
 Array = NDArray[np.float64]
 
@@ -142,26 +146,10 @@ def iterate(
     n = len(fits.parameters)
     if n == 0:
         return fits
-    from robcal.imaging.ellipse_loop import Dots, Fits, minimise_all  # compiled: imported where it runs
+    from robcal.imaging.ellipse_loop import Fits, minimise_all  # compiled: imported where it runs
 
     used = windows.valid if dropped is None else windows.valid & ~dropped
-    dots = Dots(
-        np.stack([windows.x, windows.y, windows.u, windows.v, windows.value]),
-        used,
-        windows.saturated,
-        _last(used),
-        fits.is_spot,
-        np.stack(
-            [
-                fits.parameters[:, 5] if prior_blur is None else prior_blur,
-                np.full(n, 1.0 / _LN_BLUR_SIGMA**2),
-                np.maximum(fits.shading_sigma, _SHADING_SIGMA_MIN),
-                windows.radius,
-                np.maximum(used.sum(axis=1), 1),
-            ],
-            axis=1,
-        ),
-    )
+    dots = _dots(fits, windows, used, fits.parameters[:, 5] if prior_blur is None else prior_blur)
     ended = Fits(
         fits.parameters.copy(),
         np.empty((n, PARAMETERS, PARAMETERS)),
@@ -173,6 +161,35 @@ def iterate(
     noise_model = np.array([noise.variance, noise.gain, noise.level, noise.step**2 / 12.0])
     minimise_all(dots, noise_model, np.array([steps, tolerance, _COST_DIGITS, _LN_S_MIN]), ended)
     return replace(fits, **ended._asdict())
+
+
+def _dots(fits: EllipseFits, windows: Windows, used: NDArray[np.bool_], prior_blur: Array) -> "Dots":
+    from robcal.imaging.ellipse_loop import Dots
+
+    priors = [
+        prior_blur,
+        np.full(len(used), 1.0 / _LN_BLUR_SIGMA**2),
+        np.maximum(fits.shading_sigma, _SHADING_SIGMA_MIN),
+        windows.radius,
+        np.maximum(used.sum(axis=1), 1),
+    ]
+    places = (windows.x, windows.y, windows.u, windows.v, windows.value)
+    return Dots(*places, used, windows.saturated, _last(used), fits.is_spot, np.stack(priors, axis=1))
+
+
+def bright_sums(fits: EllipseFits, windows: Windows) -> tuple[Array, Array, Array]:
+    """Of the pixels of each dot above 0.6 of its contrast: redundancy, sum of squared residuals, mean grey value (n,).
+
+    The mean is weighted by the pixels' redundancies; 0 where there are none.
+    """
+    from robcal.imaging.ellipse_loop import sum_bright  # compiled: imported where it runs
+
+    covariance = fits.covariance()
+    covariance[~np.isfinite(covariance)] = 0.0
+    sums = np.zeros((len(covariance), 3))
+    dots = _dots(fits, windows, fits.weight > 0, fits.parameters[:, 5])
+    sum_bright(dots, fits.parameters, fits.weight, covariance, sums)
+    return sums[:, 0], sums[:, 1], sums[:, 2] / np.maximum(sums[:, 0], 1e-9)
 
 
 def _last(used: NDArray[np.bool_]) -> NDArray[np.int64]:

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from robcal.jit import compiled, inner
 
 Array = NDArray[np.float64]
-Array32 = NDArray[np.float32]
 
 _BLOCK = 64  # pixels; a constant in the row offsets of `table` lets the compiler see that rows do not overlap
 _N = 12  # parameters
@@ -40,12 +39,16 @@ _BIAS, _SHIFT = np.int32(127), np.int32(23)
 class Dots(NamedTuple):
     """What n dots are fitted to, p pixels each.
 
-    `places` (5, n, p) x, y, u, v and grey value, single precision; `used`, `saturated` (n, p) bool, of which the first
-    `counts` (n,) pixels of a row are looked at; `is_spot` (n,); `priors` (n, 5) ln s, its precision, sigma of the
-    shading by the contrast, radius, number of pixels used.
+    `x`, `y`, `u`, `v`, `value` (n, p) places and grey values as in :class:`robcal.imaging.windows.Windows`; `used`,
+    `saturated` (n, p) bool, of which the first `counts` (n,) pixels of a row are looked at; `is_spot` (n,); `priors`
+    (n, 5) ln s, its precision, sigma of the shading by the contrast, radius, number of pixels used.
     """
 
-    places: Array32
+    x: NDArray
+    y: NDArray
+    u: NDArray
+    v: NDArray
+    value: NDArray
     used: NDArray[np.bool_]
     saturated: NDArray[np.bool_]
     counts: NDArray[np.int64]
@@ -60,8 +63,8 @@ class Fits(NamedTuple):
     normal: Array
     cost: Array
     converged: NDArray[np.bool_]
-    weight: Array32
-    residual: Array32
+    weight: NDArray
+    residual: NDArray
 
 
 @inner
@@ -160,7 +163,7 @@ def _block(parameters, spot, pixels, begin, m, table):  # type: ignore[no-untype
 
 
 @inner
-def _system(parameters, spot, pixels, count, first, noise, priors, table, system):  # type: ignore[no-untyped-def]
+def _system(parameters, spot, pixels, count, first, noise, priors, table, system):  # type: ignore[no-untyped-def]  # noqa: PLR0913
     """Normal equations with priors in the lower triangle of `system` (13, 13), its last entry the cost.
 
     With `first` the precision of the used pixels (those with any) is set to what the noise model says of their model.
@@ -239,7 +242,7 @@ def _limit(step, parameters, radius):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _minimise(parameters, spot, pixels, count, noise, priors, rule, table, best):  # type: ignore[no-untyped-def]
+def _minimise(parameters, spot, pixels, count, noise, priors, rule, table, best):  # type: ignore[no-untyped-def]  # noqa: PLR0913
     """One dot: parameters, the system `best` and the residuals change in place; returns convergence.
 
     `priors`: ln s, its precision, shading, radius, number of pixels used. `rule` as in :func:`minimise_all`.
@@ -284,6 +287,14 @@ def _minimise(parameters, spot, pixels, count, noise, priors, rule, table, best)
     return False
 
 
+@inner
+def _take_pixels(dots, k, pixels):  # type: ignore[no-untyped-def]
+    """Places and grey values of one dot into the rows of `pixels`."""
+    for i in range(dots.counts[k]):
+        pixels[_X, i], pixels[_Y, i], pixels[_VALUE, i] = dots.x[k, i], dots.y[k, i], dots.value[k, i]
+        pixels[_U, i], pixels[_V, i] = dots.u[k, i], dots.v[k, i]
+
+
 @compiled
 def minimise_all(dots, noise, rule, fits):  # type: ignore[no-untyped-def]
     """Fits all dots of a group; `fits` is changed in place.
@@ -297,9 +308,8 @@ def minimise_all(dots, noise, rule, fits):  # type: ignore[no-untyped-def]
     table, best = np.zeros(_ROWS * _BLOCK, np.float32), np.empty((_N + 1, _N + 1))
     for k in range(len(dots.counts)):
         count = dots.counts[k]
+        _take_pixels(dots, k, pixels)
         for i in range(count):
-            for row in range(5):
-                pixels[row, i] = dots.places[row, k, i]
             pixels[_PRECISION, i] = _1 if dots.used[k, i] else _0
             pixels[_SATURATED, i] = _1 if dots.saturated[k, i] else _0
         fits.converged[k] = _minimise(
@@ -313,3 +323,35 @@ def minimise_all(dots, noise, rule, fits):  # type: ignore[no-untyped-def]
             fits.residual[k, i] = pixels[_BEST, i]
             above = dots.saturated[k, i] and pixels[_BEST, i] < _0
             fits.weight[k, i] = _0 if above else pixels[_PRECISION, i]
+
+
+@compiled
+def sum_bright(dots, parameters, weight, covariance, sums):  # type: ignore[no-untyped-def]
+    """Redundancy, sum of squares, and sum of redundancy times grey value (n, 3) of the bright pixels of dots.
+
+    Parameters
+    ----------
+    weight : (n, p) of the fits, covariance : (n, 12, 12) of the parameters (n, 12). Bright: above 0.6 of the contrast.
+    """
+    pixels, table = np.zeros((_PIXEL_ROWS, dots.used.shape[1]), np.float32), np.zeros(_ROWS * _BLOCK, np.float32)
+    for k in range(len(dots.counts)):
+        count, half = dots.counts[k], parameters[k, 6] + 0.6 * parameters[k, 9]
+        _take_pixels(dots, k, pixels)
+        for begin in range(0, count, _BLOCK):
+            m = min(_BLOCK, count - begin)
+            _block(parameters[k], dots.is_spot[k], pixels, begin, m, table)
+            for i in range(m):
+                residual = table[_RESIDUAL * _BLOCK + i]
+                model = pixels[_VALUE, begin + i] - residual
+                if weight[k, begin + i] <= _0 or model <= half:
+                    continue
+                leverage = 0.0
+                for a in range(_N):
+                    total = 0.5 * covariance[k, a, a] * table[a * _BLOCK + i]
+                    for b in range(a):
+                        total += covariance[k, a, b] * table[b * _BLOCK + i]
+                    leverage += 2.0 * total * table[a * _BLOCK + i]
+                free = min(max(1.0 - leverage * weight[k, begin + i], 0.0), 1.0)
+                sums[k, 0] += free
+                sums[k, 1] += residual * residual
+                sums[k, 2] += free * model

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robcal.imaging.edge_model import signed_distance
-from robcal.imaging.ellipse_fit import EllipseFits, evaluate, free_shading
+from robcal.imaging.ellipse_fit import EllipseFits, bright_sums, free_shading
 from robcal.imaging.noise import NoiseModel, correlation_factor, with_gain
 from robcal.imaging.windows import Windows
 
@@ -56,19 +56,10 @@ def noise_inside(
         use = np.flatnonzero(good)
         if use.size == 0:
             continue
-        part, chosen = window.select(use), fit.select(use)
-        model, jacobian = evaluate(chosen.parameters, part, chosen.is_spot)
-        inverse = chosen.covariance()
-        inverse[~np.isfinite(inverse)] = 0.0
-        leverage = chosen.weight * (np.matmul(inverse.astype(jacobian.dtype), jacobian) * jacobian).sum(axis=1)
-        half = chosen.parameters[:, 6, None] + 0.6 * chosen.parameters[:, 9, None]
-        bright = (chosen.weight > 0) & (model > half)
-        free = np.where(bright, np.clip(1.0 - leverage, 0.0, 1.0), 0.0)
-        redundancy = free.sum(axis=1)
+        redundancy, squares, mean = bright_sums(fit.select(use), window.select(use))
         enough = redundancy > 0.1
-        squares = np.where(bright, chosen.residual**2, 0.0).sum(axis=1)
         variance.append((squares / np.maximum(redundancy, 1e-9))[enough])
-        grey.append(((free * model).sum(axis=1) / np.maximum(redundancy, 1e-9))[enough])
+        grey.append(mean[enough])
         weights.append(redundancy[enough])
     if not grey:
         return noise

@@ -8,6 +8,7 @@ threshold of its own.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -101,8 +102,8 @@ def _cut(
     height, width = image.shape
     pixels = []
     for node in nodes:
-        rows, columns = np.nonzero(node.mask)
-        pixels.append(((rows + node.y) * width + columns + node.x).astype(np.int32))
+        rows, columns = np.divmod(np.flatnonzero(node.mask).astype(np.int32), np.int32(node.mask.shape[1]))
+        pixels.append((rows + np.int32(node.y)) * np.int32(width) + columns + np.int32(node.x))
     pool, number = np.concatenate(pixels), len(nodes)
     parts = np.zeros((number + len(pool) // 4 + 1, 3))
     parts[:number, 0] = [len(some) for some in pixels]
@@ -168,7 +169,7 @@ def _without_single_pixels(above: NDArray[np.uint8]) -> tuple[NDArray[np.uint8],
 
 
 def _extended(contours: Sequence[NDArray]) -> int:
-    return sum(len(contour) > 3 for contour in contours)
+    return int(np.count_nonzero(np.fromiter(map(len, contours), np.int64, len(contours)) > 3))
 
 
 def _has_far_too_many(above: NDArray[np.uint8]) -> bool:
@@ -183,8 +184,8 @@ def _has_far_too_many(above: NDArray[np.uint8]) -> bool:
 
 def _raised(image: NDArray, lift: int) -> NDArray:
     """The image plus a constant, cut off at the top of its range."""
-    top = int(np.iinfo(image.dtype).max)
-    return np.minimum(image, top - min(lift, top)) + image.dtype.type(min(lift, top))
+    constant: Any = (min(lift, int(np.iinfo(image.dtype).max)), 0.0, 0.0, 0.0)
+    return np.asarray(cv2.add(image, constant), dtype=image.dtype)
 
 
 def _finer_nodes(

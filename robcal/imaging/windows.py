@@ -9,12 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robcal.imaging.blobs import Candidates
-from robcal.imaging.edge_model import matrix_from_axes, signed_distance
+from robcal.imaging.edge_model import matrix_from_axes
 
 Array = NDArray[np.float64]
 
 _PIXELS_PER_GROUP = 32_000  # larger ones leave the processor's cache, smaller ones spend the time on calls
-_EVEN_MAX = 250  # pixels kept of the even inside, and of the background; the centre is in the edge
 
 
 @dataclass(frozen=True)
@@ -55,17 +54,6 @@ class Windows:
         """The same in double precision."""
         wide = {name: getattr(self, name).astype(np.float64) for name in ("x", "y", "u", "v", "value")}
         return replace(self, **wide)
-
-
-def _dilate(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """3x3 dilation over the last two axes."""
-    grown = mask.copy()
-    grown[:, 1:] |= mask[:, :-1]
-    grown[:, :-1] |= mask[:, 1:]
-    wide = grown.copy()
-    wide[:, :, 1:] |= grown[:, :, :-1]
-    wide[:, :, :-1] |= grown[:, :, 1:]
-    return wide
 
 
 def gather_windows(image: NDArray, candidates: Candidates, saturation: float, neighbours: bool = True) -> list[Windows]:
@@ -119,42 +107,21 @@ def _gather(
     saturation: float,
     neighbours: bool,
 ) -> Windows:
-    height, width = image.shape
-    offset = np.arange(-half, half + 1)
+    from robcal.imaging.window_loop import gather_pixels  # compiled: imported where it runs
+
+    n, side = len(chosen), 2 * half + 1
     centre = np.rint(candidates.xy[chosen]).astype(int)
-    rows, columns = centre[:, 1, None] + offset, centre[:, 0, None] + offset
-    within = ((rows >= 0) & (rows < height))[:, :, None] & ((columns >= 0) & (columns < width))[:, None, :]
-    places = np.clip(rows, 0, height - 1)[:, :, None] * width + np.clip(columns, 0, width - 1)[:, None, :]
-    values = image.ravel().take(places).astype(np.float32)
-    n, side = len(chosen), len(offset)
     local = np.concatenate([candidates.xy[chosen] - centre, shape[chosen, 2:]], axis=1)
-    place = offset.astype(np.float32)
-    x: NDArray = np.broadcast_to(place[None, None, :], (n, side, side)).reshape(n, -1)
-    y: NDArray = np.broadcast_to(place[None, :, None], (n, side, side)).reshape(n, -1)
-    distance = signed_distance(local, x, y).reshape(n, side, side)
-    blur = candidates.blur[chosen].astype(np.float32)[:, None, None]
-    valid = within & (distance < margin[chosen].astype(np.float32)[:, None, None])
-    if neighbours:
-        base, peak = candidates.base[chosen], candidates.peak[chosen]
-        bright = (base + 0.2 * (peak - base)).astype(np.float32)[:, None, None]
-        other = (values > bright) & (distance > 2.0 * blur + 0.7)
-        valid &= ~_dilate(other)
-    # every k-th row of a large inside or background: neighbours along rows stay, they show correlated noise
-    for even in (distance < -(2.5 * blur + 0.5), valid & (distance > 2.5 * blur + 0.5)):
-        every = np.maximum(1, np.ceil(even.sum(axis=(1, 2)) / _EVEN_MAX)).astype(int)[:, None, None]
-        if every.max() > 1:
-            valid &= ~even | (rows[:, :, None] % every == 0)
-    valid = valid.reshape(n, -1)
-    # the valid pixels of each window moved to the front, padded with pixels that are not
-    width_kept = max(1, int(valid.sum(axis=1).max()))
-    order = np.argsort(~valid, axis=1, kind="stable")[:, :width_kept]
-
-    def flat(array: NDArray) -> NDArray:
-        return np.take_along_axis(array.reshape(n, -1), order, axis=1)
-
-    px, py, value = flat(x), flat(y), flat(values)
+    base, peak = candidates.base[chosen], candidates.peak[chosen]
+    scales = np.stack([candidates.blur[chosen], margin[chosen], base + 0.2 * (peak - base)], axis=1)
+    every: list[NDArray] = [np.zeros((n, side * side), np.float32) for _ in range(3)]
+    counts = gather_pixels(image, centre - half, local, scales, half, neighbours, *every)
+    # padded with pixels that are not valid
+    width_kept = max(1, int(counts.max()))
+    x, y, value = (np.ascontiguousarray(column[:, :width_kept]) for column in every)
+    valid = np.arange(width_kept) < counts[:, None]
     radius = np.sqrt(np.prod(candidates.semi_axes[chosen], axis=1))
     start = local[:, :2].astype(np.float32)
     scale = (1.0 / radius).astype(np.float32)[:, None]
-    u, v = (px - start[:, :1]) * scale, (py - start[:, 1:]) * scale
-    return Windows(chosen, centre.astype(float), px, py, u, v, value, flat(valid), radius, value >= saturation)
+    u, v = (x - start[:, :1]) * scale, (y - start[:, 1:]) * scale
+    return Windows(chosen, centre.astype(float), x, y, u, v, value, valid, radius, valid & (value >= saturation))

@@ -41,7 +41,7 @@ def identify_from_instruments(
     kernel = Kernel(model)
     notes: list[str] = []
     start = model
-    for i in sorted(instruments, key=lambda i: -i.dimension):
+    for i in sorted((i for i in instruments if not i.loop), key=lambda i: -i.dimension):
         rows = i.recording.poses
         chosen = replace(i.recording, observations=i.recording.select(rows), detailed=())
         try:
@@ -99,7 +99,9 @@ def length_alarms(found: IdentifiedInstruments) -> list[str]:
 
     Sag, stretch or a wrong scale of a wire fit into the robot with small residuals and make it worse.
     """
-    identified = [p for p in found.placed.values() if p.robot is not None]
+    identified = [p for p in found.placed.values() if p.robot is not None and not p.instrument.loop]
+    if not identified:
+        return []
     robot = identified[0].robot
     if robot is None or any(p.instrument.dimension > 1 for p in identified):
         return []
@@ -170,7 +172,9 @@ def _on_rows(
         tested = found.seen_by(name, robot or leading_identification(found).robot)
     inputs = tested.inputs(log.as_stated())
     known = placed.sound if len(placed.sound) else rows
-    nominal = fit_nominal(model, inputs.subset(known), placed.recording.select(known))
+    nominal = CalibratedRobot(model=placed.nominal)
+    if not placed.instrument.loop:
+        nominal = fit_nominal(model, inputs.subset(known), placed.recording.select(known))
     return verify(tested, inputs.subset(rows), placed.recording.select(rows), nominal)
 
 

@@ -110,7 +110,9 @@ def diagnose_instruments(
     ----------
     model : the nominal robot. found : identified from ``instruments``. corrections : as for the identification.
     """
-    taking_part = {name: p for name, p in found.placed.items() if p.robot is not None}
+    taking_part = {n: p for n, p in found.placed.items() if p.robot is not None and not p.instrument.loop}
+    if not taking_part:
+        return InstrumentsDiagnosis({}, (), found, model)
     best = max(p.instrument.dimension for p in taking_part.values())
     others = [p.instrument for p in taking_part.values() if p.instrument.dimension == best]
     own: dict[str, Diagnosis] = {}

@@ -153,31 +153,14 @@ def compensate(
     path = options.as_path and len(F) > 0
     chosen = follow(solutions, solutions.near[0], explain=False) if path else select(solutions, explain=False)
     every = kernel.poses(np.where(chosen.reachable[:, None], chosen.q, solutions.near), payload, covariates)
+    task = _Task(kernel, chain, every, target, world_T_base, options)
     state = _State(chosen.q.copy(), list(chosen.reason), np.full((len(F), 6), np.nan))
     rows = np.flatnonzero(chosen.reachable)
-    state.remaining[rows] = _twist(kernel, every.subset(rows), target[rows])
+    state.remaining[rows] = task.twist(rows, chosen.q[rows])
     before = state.remaining.copy()
-    steps = 0
-    most = {"exact": options.iterations, "first_order": 1, "none": 0}[options.method]
-    size = _size(chain, before)
-    quick = np.full(len(F), options.method == "exact" or chain.n_joints < 6)
-    while steps < most and len(rows):
-        steps += 1
-        # joint steps while they gain much; near singularities the closed form of the corrected target
-        stepped = _joint_step(chain, state, rows[quick[rows]])
-        rest = np.setdiff1d(rows, stepped, assume_unique=True)
-        quick[rest] = False
-        moved = _correct(kernel, chain, state, every, F, rest, world_T_base)
-        rows = np.concatenate([stepped, rest[moved]])
-        state.remaining[rows] = _twist(kernel, every.subset(rows).with_q(state.q[rows]), target[rows])
-        new = _size(chain, state.remaining[rows])
-        # a loop that gains nothing ends
-        going = (new > options.tolerance) & ((new < 0.9 * size[rows]) | (steps < 3))
-        quick[rows] &= (new < 0.25 * size[rows]) | (chain.n_joints < 6)
-        size[rows] = np.minimum(size[rows], new)
-        rows = rows[going]
+    steps = _iterate(task, state, rows)
     if options.method == "exact":
-        _search_on(kernel, chain, state, every, target, solutions.near, options)
+        _search_on(task, state)
     reachable = np.all(np.isfinite(state.q), axis=1)
     # the nearest pose costs a search, so reasons are found last and only for so many
     unexplained = [i for i in np.flatnonzero(~reachable) if state.reason[i] is None]
@@ -201,13 +184,51 @@ class _State:
     remaining: Array
 
 
+@dataclass(frozen=True)
+class _Task:
+    """What is wanted: the tool of the real robot at ``target`` (n, 4, 4) in the world, by a nominal ``chain``."""
+
+    kernel: Kernel
+    chain: Chain
+    every: PoseInputs
+    target: Array
+    world_T_base: Array
+    options: CompensationSettings
+
+    def twist(self, rows: Rows, q: Array) -> Array:
+        """(k, 6) from the wanted frames of some rows to the real tool at joint values (k, N)."""
+        moved = self.every.subset(rows).with_q(q)
+        return difference(self.target[rows], self.kernel.frames(self.kernel.theta0, moved))
+
+
+def _iterate(task: _Task, state: _State, rows: Rows) -> int:
+    """Correct the rows until they gain nothing any more, in place; number of corrections."""
+    chain, options = task.chain, task.options
+    most = {"exact": options.iterations, "first_order": 1, "none": 0}[options.method]
+    size = _size(chain, state.remaining)
+    quick = np.full(len(state.q), options.method == "exact" or chain.n_joints < 6)
+    steps = 0
+    while steps < most and len(rows):
+        steps += 1
+        # joint steps while they gain much; near singularities the closed form of the corrected target
+        stepped = _joint_step(chain, state, rows[quick[rows]])
+        rest = np.setdiff1d(rows, stepped, assume_unique=True)
+        quick[rest] = False
+        moved = _correct(task, state, rest)
+        rows = np.concatenate([stepped, rest[moved]])
+        state.remaining[rows] = task.twist(rows, state.q[rows])
+        new = _size(chain, state.remaining[rows])
+        # a loop that gains nothing ends
+        going = (new > options.tolerance) & ((new < 0.9 * size[rows]) | (steps < 3))
+        quick[rows] &= (new < 0.25 * size[rows]) | (chain.n_joints < 6)
+        size[rows] = np.minimum(size[rows], new)
+        rows = rows[going]
+    return steps
+
+
 def _size(chain: Chain, twist: Array) -> Array:
     """Largest component of twists (n, 6); of their positions alone where orientation cannot be followed."""
     return np.max(np.abs(twist[:, :3] if chain.n_joints < 6 else twist), axis=1, initial=0.0)
-
-
-def _twist(kernel: Kernel, poses: PoseInputs, target: Array) -> Array:
-    return difference(target, kernel.frames(kernel.theta0, poses))
 
 
 def _joint_step(chain: Chain, state: _State, rows: Rows) -> Rows:
@@ -236,20 +257,19 @@ def _joint_step(chain: Chain, state: _State, rows: Rows) -> Rows:
     return rows[good]
 
 
-def _correct(
-    kernel: Kernel, chain: Chain, state: _State, every: PoseInputs, F: Array, rows: Rows, world_T_base: Array
-) -> BoolArray:
+def _correct(task: _Task, state: _State, rows: Rows) -> BoolArray:
     """``F* <- F* Fh^-1 F`` with ``F* = K(q)`` and its joint values, in place; False where that is out of reach."""
     if not len(rows):
         return np.zeros(0, bool)
-    q = state.q[rows]
+    q, chain, kernel = state.q[rows], task.chain, task.kernel
     if chain.n_joints < 6:
         for i in rows:
             state.reason[i] = "the correction leads beyond a joint limit or out of the workspace"
         state.q[rows] = np.nan
         return np.zeros(len(rows), bool)
-    Fh = invert(world_T_base) @ kernel.frames(kernel.theta0, every.subset(rows).with_q(q))
-    F_star = forward(chain, q) @ invert(Fh) @ F[rows]
+    base_T_world = invert(task.world_T_base)
+    Fh = base_T_world @ kernel.frames(kernel.theta0, task.every.subset(rows).with_q(q))
+    F_star = forward(chain, q) @ invert(Fh) @ (base_T_world @ task.target[rows])
     chosen = select(inverse_kinematics(chain, F_star, q, all_branches=False), explain=False)
     with np.errstate(invalid="ignore"):
         flipped = chosen.reachable & (np.max(np.abs(chosen.q - q), axis=1) > FLIP)
@@ -264,26 +284,19 @@ def _correct(
     return moved
 
 
-def _search_on(
-    kernel: Kernel,
-    chain: Chain,
-    state: _State,
-    every: PoseInputs,
-    target: Array,
-    near: Array,
-    options: CompensationSettings,
-) -> None:
+def _search_on(task: _Task, state: _State) -> None:
     """Rows that the correction did not solve, on the real model itself: damped least squares within the limits.
 
     Near a singularity or the edge of the workspace F* may be out of the nominal robot's reach and F yet within the
     real one's.
     """
+    kernel, chain, options = task.kernel, task.chain, task.options
     with np.errstate(invalid="ignore"):
         solved = _size(chain, state.remaining) <= options.tolerance
     rows = np.flatnonzero(~(solved & np.all(np.isfinite(state.q), axis=1)))
     if not len(rows):
         return
-    poses = every.subset(rows)
+    poses = task.every.subset(rows)
     known = np.isfinite(state.q[rows])
     start = np.where(known, state.q[rows], poses.q)
 
@@ -292,8 +305,8 @@ def _search_on(
         return kernel.frames(kernel.theta0, moved), kernel.joint_jacobian(kernel.theta0, moved)
 
     settings = NumericSettings(tolerance=options.tolerance)
-    q, _ = refine(chain, target[rows], start, settings, within_limits=True, evaluate=at)
-    twist = _twist(kernel, poses.with_q(q), target[rows])
+    q, _ = refine(chain, task.target[rows], start, settings, within_limits=True, evaluate=at)
+    twist = task.twist(rows, q)
     reached = settings.reached(chain, 0.1 * twist) if chain.n_joints >= 6 else settings.reached(chain, twist)
     had = np.all(known, axis=1)
     with np.errstate(invalid="ignore"):

@@ -54,87 +54,121 @@ def pose_graph(model: RobotModel, statics: str = "one_step", derivatives: bool =
     """
     if statics not in ("one_step", "converged"):
         raise InvalidInput(f"statics must be one_step or converged, not '{statics}'")
-    names = parameter_names(model)
-    index = {name: k for k, name in enumerate(names)}
-    n, n_q = len(model.frames), model.n_joints
-    theta, q = ca.SX.sym("theta", len(names)), ca.SX.sym("q", n_q)
-    load = ca.SX.sym("load", len(model.payloads))
-    covariate_names = _covariates(model)
-    covariates = ca.SX.sym("covariates", len(covariate_names))
-    W0, F0 = ca.SX.sym("world_T_base", 3, 4), ca.SX.sym("flange_T_tool", 3, 4)
-    inputs = [theta, q, load, covariates, W0, F0]
-
-    load_mass, load_moment, load_columns = _load(model, theta, index, load)
+    x = _Inputs.of(model)
+    pull = _Pull.of(model, x)
     m = ca.SX.sym("m", len(moment_names(model)))
-    coordinates = _coordinates(model, theta, q, m, covariates, covariate_names, load_mass, index)
+    coordinates = _coordinates(model, x, m, pull.mass)
     at_rest = ca.substitute(coordinates, m, ca.SX.zeros(m.shape))
-
-    g0, tilt_columns = _gravity(model, theta, index)
-    world_gravity = model.gravity_frame == "world"
-
-    def chain_at(c: ca.SX) -> StaticChain:
-        g = g0
-        if world_gravity:
-            R_base = ca.mtimes(W0[:, :3], local_frame(c[:6]).R)
-            g = ca.mtimes(R_base.T, g0)
-        return static_chain(model, [c[6 * (i + 1) : 6 * (i + 2)] for i in range(n)], g, load_mass, load_moment)
-
-    chain = chain_at(at_rest)
+    chain = pull.chain(at_rest)
     moment = moments(model, chain)
     coupled = bool(ca.depends_on(coordinates, m))
     if statics == "converged" and coupled:
         for _ in range(CONVERGED_ROUNDS):
-            chain = chain_at(ca.substitute(coordinates, m, moment))
+            chain = pull.chain(ca.substitute(coordinates, m, moment))
             moment = moments(model, chain)
     deflected = ca.substitute(coordinates, m, moment) if coupled else coordinates
-    tool = _tool_chain(deflected, n, W0, F0)
+    tool = _tool_chain(deflected, len(model.frames), x.world_T_base, x.flange_T_tool)
     world_T_tool = ca.horzcat(tool.tool_R_world.T, -ca.mtimes(tool.tool_R_world.T, tool.world_origin))
     if not derivatives:
         empty = ca.SX()
-        return PoseGraph(inputs, covariate_names, world_T_tool, empty, empty, empty, moment)
-
+        return PoseGraph(x.all, x.covariate_names, world_T_tool, empty, empty, empty, moment)
     G = tool.columns
-    unknowns = ca.vertcat(theta, q)
+    unknowns = ca.vertcat(x.theta, x.q)
     D = ca.jacobian(coordinates, unknowns)
-    S = ca.jacobian(coordinates, m)
-    D, S, D_rest = (
-        (ca.substitute(D, m, moment), ca.substitute(S, m, moment), ca.substitute(D, m, ca.SX.zeros(m.shape)))
-        if coupled
-        else (D, S, D)
-    )
-    base_six = (at_rest if statics == "one_step" else deflected)[:6]  # those for which the moments were taken
-    base_lines = _base_lines(base_six)
-    base_R = ca.mtimes(W0[:, :3], local_frame(base_six).R) if world_gravity else ca.SX.eye(3)
-
-    def feedback(W: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """K: derivative of W m by all coordinates; L: by the unknowns at fixed coordinates."""
-        sweep = moment_sweep(model, chain, W)
-        K_base = ca.SX(6, 6)
-        if world_gravity:
-            K_base = ca.horzcat(
-                ca.SX(6, 3), *(ca.mtimes(sweep.by_gravity, ca.cross(chain.g, line)) for line in base_lines)
-            )
-        K = ca.horzcat(K_base, sweep.by_coordinate, ca.SX(6, 6))
-        L = ca.SX(6, unknowns.numel())
-        for k, dg in tilt_columns.items():
-            L[:, k] = ca.mtimes(sweep.by_gravity, ca.mtimes(base_R.T, dg))
-        for k, (d_mass, d_moment) in load_columns.items():
-            L[:, k] = sweep.by_mass * d_mass + ca.mtimes(sweep.by_first, ca.mtimes(chain.rotations[-1], d_moment))
-        return K, L
-
     if not coupled:
         J, basis = ca.mtimes(G, D), G
-    elif statics == "one_step":
-        K, L = feedback(ca.mtimes(G, S))
-        J, basis = ca.mtimes(G, D) + ca.mtimes(K, D_rest) + L, G + K
     else:
-        basis = G
-        for _ in range(CONVERGED_ROUNDS):
-            K, L = feedback(ca.mtimes(basis, S))
-            basis = G + K
-        J = ca.mtimes(basis, D) + L
-    p = theta.numel()
-    return PoseGraph(inputs, covariate_names, world_T_tool, J[:, :p], J[:, p:], basis, moment)
+        S = ca.substitute(ca.jacobian(coordinates, m), m, moment)
+        D, D_rest = ca.substitute(D, m, moment), ca.substitute(D, m, ca.SX.zeros(m.shape))
+        base_six = (at_rest if statics == "one_step" else deflected)[:6]  # those for which the moments were taken
+        if statics == "one_step":
+            K, L = pull.feedback(chain, base_six, ca.mtimes(G, S), unknowns.numel())
+            J, basis = ca.mtimes(G, D) + ca.mtimes(K, D_rest) + L, G + K
+        else:
+            basis = G
+            for _ in range(CONVERGED_ROUNDS):
+                K, L = pull.feedback(chain, base_six, ca.mtimes(basis, S), unknowns.numel())
+                basis = G + K
+            J = ca.mtimes(basis, D) + L
+    p = x.theta.numel()
+    return PoseGraph(x.all, x.covariate_names, world_T_tool, J[:, :p], J[:, p:], basis, moment)
+
+
+@dataclass(frozen=True)
+class _Inputs:
+    """Symbols of all inputs; ``index`` of the parameters in ``theta``."""
+
+    theta: ca.SX
+    q: ca.SX
+    load: ca.SX
+    covariates: ca.SX
+    world_T_base: ca.SX
+    flange_T_tool: ca.SX
+    index: dict[str, int]
+    covariate_names: tuple[str, ...]
+
+    @classmethod
+    def of(cls, model: RobotModel) -> "_Inputs":
+        names, covariates = parameter_names(model), _covariates(model)
+        return cls(
+            ca.SX.sym("theta", len(names)),
+            ca.SX.sym("q", model.n_joints),
+            ca.SX.sym("load", len(model.payloads)),
+            ca.SX.sym("covariates", len(covariates)),
+            ca.SX.sym("world_T_base", 3, 4),
+            ca.SX.sym("flange_T_tool", 3, 4),
+            {name: k for k, name in enumerate(names)},
+            covariates,
+        )
+
+    @property
+    def all(self) -> list[ca.SX]:
+        """In the order of :class:`PoseGraph`."""
+        return [self.theta, self.q, self.load, self.covariates, self.world_T_base, self.flange_T_tool]
+
+
+@dataclass(frozen=True)
+class _Pull:
+    """Gravity (in its own frame) and the load's mass and first moment, with derivatives by their own parameters."""
+
+    model: RobotModel
+    world_T_base: ca.SX
+    gravity: ca.SX
+    tilt_columns: dict[int, ca.SX]
+    mass: ca.SX
+    moment: ca.SX
+    load_columns: dict[int, tuple[ca.SX, ca.SX]]
+
+    @classmethod
+    def of(cls, model: RobotModel, x: _Inputs) -> "_Pull":
+        return cls(model, x.world_T_base, *_gravity(model, x.theta, x.index), *_load(model, x.theta, x.index, x.load))
+
+    def _base_R(self, base_six: ca.SX) -> ca.SX:
+        """Rotation of the base in the frame of gravity."""
+        if self.model.gravity_frame != "world":
+            return ca.SX.eye(3)
+        return ca.mtimes(self.world_T_base[:, :3], local_frame(base_six).R)
+
+    def chain(self, c: ca.SX) -> StaticChain:
+        """The loaded chain at coordinates of base, every frame, and tool."""
+        g = ca.mtimes(self._base_R(c[:6]).T, self.gravity) if self.model.gravity_frame == "world" else self.gravity
+        frames = [c[6 * (i + 1) : 6 * (i + 2)] for i in range(len(self.model.frames))]
+        return static_chain(self.model, frames, g, self.mass, self.moment)
+
+    def feedback(self, chain: StaticChain, base_six: ca.SX, W: ca.SX, unknowns: int) -> tuple[ca.SX, ca.SX]:
+        """K: derivative of ``W moments`` by all coordinates; L: by the unknowns at fixed coordinates."""
+        sweep = moment_sweep(self.model, chain, W)
+        K_base = ca.SX(6, 6)
+        if self.model.gravity_frame == "world":
+            turned = [ca.mtimes(sweep.by_gravity, ca.cross(chain.g, line)) for line in _base_lines(base_six)]
+            K_base = ca.horzcat(ca.SX(6, 3), *turned)
+        base_R = self._base_R(base_six)
+        L = ca.SX(6, unknowns)
+        for k, dg in self.tilt_columns.items():
+            L[:, k] = ca.mtimes(sweep.by_gravity, ca.mtimes(base_R.T, dg))
+        for k, (d_mass, d_moment) in self.load_columns.items():
+            L[:, k] = sweep.by_mass * d_mass + ca.mtimes(sweep.by_first, ca.mtimes(chain.rotations[-1], d_moment))
+        return ca.horzcat(K_base, sweep.by_coordinate, ca.SX(6, 6)), L
 
 
 def expression_variables(model: RobotModel) -> frozenset[str]:
@@ -182,17 +216,9 @@ def _gravity(model: RobotModel, theta: ca.SX, index: dict[str, int]) -> tuple[ca
     return g, {tilt[0]: by_x, tilt[1]: by_y}
 
 
-def _coordinates(
-    model: RobotModel,
-    theta: ca.SX,
-    q: ca.SX,
-    m: ca.SX,
-    covariates: ca.SX,
-    covariate_names: tuple[str, ...],
-    load_mass: ca.SX,
-    index: dict[str, int],
-) -> ca.SX:
+def _coordinates(model: RobotModel, x: _Inputs, m: ca.SX, load_mass: ca.SX) -> ca.SX:
     """Six coordinates of base, every frame, and tool; the moments enter as symbols."""
+    theta, q, index = x.theta, x.q, x.index
     at = {"base": 0, "tool": 6 * (len(model.frames) + 1)} | {f.name: 6 * (i + 1) for i, f in enumerate(model.frames)}
     values: list[ca.SX] = [theta[index[f"base.{k}"]] for k in GEOMETRIC_KINDS]
     joint = 0
@@ -208,7 +234,8 @@ def _coordinates(
     values += [theta[index[f"tool.{k}"]] for k in GEOMETRIC_KINDS]
 
     if model.terms:
-        symbols = _symbols(model, q, m, load_mass) | {c: covariates[k] for k, c in enumerate(covariate_names)}
+        covariates = {name: x.covariates[k] for k, name in enumerate(x.covariate_names)}
+        symbols = _symbols(model, q, m, load_mass) | covariates
         for term in model.terms:
             own = {short: theta[index[f"{term.name}.{short}"]] for short in term.parameters}
             value = graph(term.expression, {**symbols, **own})

@@ -234,17 +234,7 @@ def _check(model: RobotModel) -> None:
                 f"{', '.join(sorted(RESERVED_FRAME_NAMES))}; rename it"
             )
         seen.add(f.name)
-        if f.axis not in (None, "x", "y", "z"):
-            raise InvalidInput(f"{where}, frame {f.name}: axis must be x, y, z or null, not '{f.axis}'")
-        if f.sign not in (1, -1):
-            raise InvalidInput(f"{where}, frame {f.name}: sign must be +1 or -1, not {f.sign}")
-        numbers = (*f.xyz, *f.rpy, f.mass, *f.cog)
-        if len(f.xyz) != 3 or len(f.rpy) != 3 or len(f.cog) != 3 or not all(math.isfinite(v) for v in numbers):
-            raise InvalidInput(f"{where}, frame {f.name}: offsets, angles, mass and centre of gravity must be finite")
-        if f.mass < 0:
-            raise InvalidInput(f"{where}, frame {f.name}: mass {f.mass} kg is negative")
-        if f.limits is not None and not f.limits[0] <= f.limits[1]:
-            raise InvalidInput(f"{where}, frame {f.name}: the lower limit is above the upper one")
+        _check_frame(f, f"{where}, frame {f.name}")
     for name, payload in model.payloads.items():
         if not all(math.isfinite(v) for v in (payload.mass, *payload.cog)) or payload.mass < 0:
             raise InvalidInput(f"{where}, payload '{name}': mass and centre of gravity must be finite, mass >= 0")
@@ -253,15 +243,33 @@ def _check(model: RobotModel) -> None:
     if len(model.gravity) != 3 or not all(math.isfinite(v) for v in model.gravity):
         raise InvalidInput(f"{where}: gravity must be three finite numbers in m/s2")
     for term in model.terms:
-        if term.frame not in seen and term.frame not in ("base", "tool"):
-            raise InvalidInput(f"{where}, term {term.name}: there is no frame '{term.frame}'")
-        if term.kind not in (*GEOMETRIC_KINDS, "q"):
-            raise InvalidInput(f"{where}, term {term.name}: kind '{term.kind}' is not q, x, y, z, roll, pitch or yaw")
-        if term.kind == "q" and model.joint_of(term.frame) is None:
-            raise InvalidInput(f"{where}, term {term.name}: frame '{term.frame}' has no joint for kind q")
+        _check_term(model, term, f"{where}, term {term.name}")
     known = set(parameter_names(model))
     for name, value in model.parameters.items():
         if name not in known:
             raise InvalidInput(f"{where}: unknown parameter '{name}'; names are <frame>.<kind>")
         if not math.isfinite(value):
             raise InvalidInput(f"{where}: parameter '{name}' is not finite")
+
+
+def _check_frame(f: Frame, where: str) -> None:
+    if f.axis not in (None, "x", "y", "z"):
+        raise InvalidInput(f"{where}: axis must be x, y, z or null, not '{f.axis}'")
+    if f.sign not in (1, -1):
+        raise InvalidInput(f"{where}: sign must be +1 or -1, not {f.sign}")
+    numbers = (*f.xyz, *f.rpy, f.mass, *f.cog)
+    if len(f.xyz) != 3 or len(f.rpy) != 3 or len(f.cog) != 3 or not all(math.isfinite(v) for v in numbers):
+        raise InvalidInput(f"{where}: offsets, angles, mass and centre of gravity must be finite")
+    if f.mass < 0:
+        raise InvalidInput(f"{where}: mass {f.mass} kg is negative")
+    if f.limits is not None and not f.limits[0] <= f.limits[1]:
+        raise InvalidInput(f"{where}: the lower limit is above the upper one")
+
+
+def _check_term(model: RobotModel, term: Term, where: str) -> None:
+    if term.frame not in {"base", "tool", *(f.name for f in model.frames)}:
+        raise InvalidInput(f"{where}: there is no frame '{term.frame}'")
+    if term.kind not in (*GEOMETRIC_KINDS, "q"):
+        raise InvalidInput(f"{where}: kind '{term.kind}' is not q, x, y, z, roll, pitch or yaw")
+    if term.kind == "q" and model.joint_of(term.frame) is None:
+        raise InvalidInput(f"{where}: frame '{term.frame}' has no joint for kind q")

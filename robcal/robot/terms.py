@@ -194,15 +194,7 @@ def identifier(name: str) -> str:
 def _check(node: ast.AST, expression: str) -> None:
     """Depth-first whitelist; whatever is not listed is refused."""
     if isinstance(node, ast.Constant):
-        if isinstance(node.value, bool) or not isinstance(node.value, int | float):
-            raise InvalidInput(f"'{expression[:120]}': {node.value!r} is not a number")
-        try:
-            finite = math.isfinite(float(node.value))
-        except OverflowError:
-            finite = False
-        if not finite:
-            raise InvalidInput(f"'{expression[:120]}': a number is too large")
-        return None
+        return _check_number(node, expression)
     if isinstance(node, ast.Name):
         if node.id.startswith("__"):
             raise InvalidInput(f"'{expression[:120]}': the name '{node.id}' is not allowed")
@@ -230,6 +222,17 @@ def _check(node: ast.AST, expression: str) -> None:
             _check(argument, expression)
         return None
     raise InvalidInput(f"'{expression[:120]}': {type(node).__name__} is not allowed in a term's expression")
+
+
+def _check_number(node: ast.Constant, expression: str) -> None:
+    if isinstance(node.value, bool) or not isinstance(node.value, int | float):
+        raise InvalidInput(f"'{expression[:120]}': {node.value!r} is not a number")
+    try:
+        finite = math.isfinite(float(node.value))
+    except OverflowError:
+        finite = False
+    if not finite:
+        raise InvalidInput(f"'{expression[:120]}': a number is too large")
 
 
 def _literal(node: ast.AST) -> float | None:

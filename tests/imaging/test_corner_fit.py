@@ -67,7 +67,7 @@ def test_scatter_is_that_of_the_covariance_and_there_is_no_bias() -> None:
     value, _ = blurred_corner(shape, np.zeros((n, 2)), px, py)
     grey = 120.0 + 3.0 * px / half + 80.0 * value + rng.normal(0, noise, value.shape)
     none = np.zeros(grey.shape, bool)
-    windows = CornerWindows(np.zeros((n, 2)), grey, ~none, none, np.zeros((n, 2)), half)
+    windows = CornerWindows(np.zeros((n, 2)), px, py, grey, ~none, none, np.zeros((n, 2)), half)
     start = shape + np.column_stack([rng.normal(0, 0.5, (n, 2)), rng.normal(0, 0.05, (n, 2)), rng.normal(0, 0.2, n)])
     fits = fit_corners(windows, start, NoiseModel(noise**2, 0.0, 40.0))
     error = fits.xy - true[:, :2]

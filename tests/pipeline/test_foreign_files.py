@@ -107,9 +107,9 @@ def test_a_camera_of_a_chain_is_chosen_by_name(tmp_path):
 @pytest.mark.parametrize(
     ("write", "words"),
     [
-        (lambda p: kalibr_file(p, "equidistant"), "equidistant.*self-calibrated"),
-        (lambda p: ros_file(p, "equidistant"), "equidistant"),
-        (lambda p: ros_file(p, "rational_polynomial", (0.1, 0.0, 0.0)), "8 distortion coefficients"),
+        (lambda p: kalibr_file(p, "fov"), "fov.*self-calibrated"),
+        (lambda p: ros_file(p, "equidistant"), "a fisheye lens has four coefficients"),
+        (lambda p: ros_file(p, "rational_polynomial", (0.1,) * 9), "tilted sensor"),
         (lambda p: metashape_file(p, "<k4>0.01</k4>"), "k4"),
         (lambda p: p.write_text("K: [800, 0, 320, 0, 800, 240, 0, 0, 1]\n"), "size of the images is missing"),
         (lambda p: p.write_text("%YAML:1.0\n---\ncamera_matrix: !!opencv-matrix\n   rows: 3\n"), "OpenCV wrote"),

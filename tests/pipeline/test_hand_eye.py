@@ -10,10 +10,13 @@ import numpy as np
 import pytest
 import yaml
 
+from fixtures.board_pattern import BoardPattern
 from fixtures.campaigns import write_table, write_yaml
-from fixtures.hand_eye import Scene, exchanged, place, scene, turn
-from fixtures.hand_eye_files import write_scene
+from fixtures.hand_eye import Scene, exchanged, looking, place, scene, turn
+from fixtures.hand_eye_files import write_images, write_scene
+from fixtures.optics import TrueCamera
 from fixtures.true_robot import Circumstances, TrueRobot
+from pipeline.pose_generation import generate_poses
 from pipeline.prediction import predict_run
 from pipeline.runner import run_campaign
 from robcal.errors import InvalidInput
@@ -37,7 +40,9 @@ def error_in_sigmas(told: dict, true: np.ndarray) -> np.ndarray:  # type: ignore
 
 @pytest.fixture(scope="module")
 def hand_run(tmp_path_factory):  # type: ignore[no-untyped-def]
-    seen = made(2)
+    X = place(turn(np.array([0.1, -0.1, 0.4])), np.array([0.03, 0.02, 0.05]))
+    Z = place(turn(np.array([np.pi, 0.0, 0.0])), np.array([0.3, 0.1, 0.0]))
+    seen = made(2, carriers=(X, Z))
     root = tmp_path_factory.mktemp("hand")
     done = run_campaign(write_scene(root / "campaign", seen), root / "run")
     return root / "run", seen, done.result
@@ -186,3 +191,47 @@ def test_motions_about_one_axis_are_refused_with_the_file_named(tmp_path: Path) 
     folder = write_scene(tmp_path / "c", replace(seen, commanded=np.array(spun)))
     with pytest.raises(Exception, match=r"campaign.yaml: hand_eye.*one direction only.*about its [xz] or [xz] axis"):
         run_campaign(folder, tmp_path / "r")
+
+
+def test_the_next_poses_are_proposed_from_guesses_and_from_a_run(hand_run, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    run = hand_run[0]
+    campaign = run.parent / "campaign"
+    guess = {
+        "camera": str(campaign / "eye.yaml"),
+        "board": str(campaign / "board.yaml"),
+        "flange_T_camera": {"xyz_mm": [30, 20, 50], "rpy_deg": [0, 0, 20]},
+        "base_T_board": {"xyz_mm": [300, 100, 0], "rpy_deg": [180, 0, 0]},
+    }
+    base = {"format": "robcal/poses-1", "robot": str(ROBOT), "choice": {"count": 5, "verify": 1, "candidates": 120}}
+    write_yaml(tmp_path / "poses.yaml", base | {"hand_eye": guess})
+    told = generate_poses(tmp_path / "poses.yaml", tmp_path / "poses.csv")
+    assert told["poses"] == 6
+    assert len((tmp_path / "poses.csv").read_text().splitlines()) == 7
+    for change, words in (
+        ({"base_T_board": None}, "base_T_board is missing"),
+        ({"camera": None}, "needs a 'run'"),
+        ({"distance_mm": [500, 300]}, "exchange the two"),
+        ({"run": str(tmp_path)}, "not a run folder"),
+    ):
+        write_yaml(tmp_path / "bad.yaml", base | {"hand_eye": {k: v for k, v in (guess | change).items() if v}})
+        with pytest.raises(InvalidInput, match=words):
+            generate_poses(tmp_path / "bad.yaml", tmp_path / "bad.csv")
+    write_yaml(tmp_path / "again.yaml", base | {"hand_eye": {"run": str(run)}})
+    told = generate_poses(tmp_path / "again.yaml", tmp_path / "again.csv")
+    assert np.linalg.norm(told["sigma_mm"]) < 0.2
+
+
+@pytest.mark.slow
+def test_from_rendered_images_of_a_charuco_board(tmp_path: Path) -> None:
+    pattern = BoardPattern("charuco", 7, 5, square=0.03, marker=0.022)
+    camera = TrueCamera(560, 420, 640.0, 640.0, 281.0, 208.0, k1=-0.1, psf_px=0.7)
+    rng = np.random.default_rng(3)
+    marks = np.column_stack([pattern.marks(), np.zeros(len(pattern.marks()))])
+    views = np.array([looking(rng, marks, (0.3, 0.42), 0.6, np.pi) for _ in range(6)])
+    seen = scene(rng, "hand", views=views, scatter=(1e-4, 1e-4))
+    folder = write_images(tmp_path / "c", pattern, camera, seen, views)
+    found = run_campaign(folder, tmp_path / "r").result["hand_eye"]
+    assert found["images"] == 6
+    assert np.all(np.abs(error_in_sigmas(found["flange_T_camera"], seen.X)) < 5)
+    assert found["heldout_px"] < 1.0
+    assert found["noise_px"] < 0.1

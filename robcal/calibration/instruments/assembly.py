@@ -144,7 +144,9 @@ def _identified(
     )
     sound = rows[used]
     inputs = log.inputs(robot.kernel).subset(sound)
-    nominal = fit_nominal(found.engine.kernel.model, inputs, instrument.recording.select(sound))
+    bare = replace(found.engine.kernel.model.nominal(), world_T_base=W, flange_T_tool=F)
+    if not instrument.loop:
+        bare = fit_nominal(found.engine.kernel.model, inputs, instrument.recording.select(sound)).model
     held = tuple(coordinate_title(n) for n in titles if n in found.solution.eliminated)
     held += tuple(f"wire.{k}" for k, n in zip(own.wire, own.wire_names, strict=True) if n in found.solution.eliminated)
     return PlacedInstrument(
@@ -159,8 +161,8 @@ def _identified(
         F,
         _cell_block(names, covariance),
         held,
-        nominal.model,
-        robot.with_recording(log, nominal.model),
+        bare,
+        robot.with_recording(log, bare),
         _wire(found, own),
     )
 
@@ -245,7 +247,9 @@ def _verifying(
         state = replace(found.solution.state, world_T_base=np.eye(4), flange_T_tool=np.eye(4), theta=kernel.theta0)
         scatter = joint_scatter(kernel, state, part.poses, found.options.joint_sigma)
     at = place(part, kernel.frames(kernel.theta0, part.poses), located, scatter=scatter)
-    nominal = fit_nominal(found.engine.kernel.model, part.poses, part.observations)
+    bare = replace(found.engine.kernel.model.nominal(), world_T_base=at.world_T_base, flange_T_tool=at.flange_T_tool)
+    if not instrument.loop:
+        bare = fit_nominal(found.engine.kernel.model, part.poses, part.observations).model
     nobody = np.zeros(0, dtype=np.int64)
     return PlacedInstrument(
         instrument,
@@ -259,5 +263,5 @@ def _verifying(
         at.flange_T_tool,
         at.covariance,
         at.held,
-        nominal.model,
+        bare,
     )

@@ -88,6 +88,9 @@ def orthonormal_basis(jacobian: Array) -> Array:
     """Orthonormal columns that span a (possibly rank-deficient) Jacobian (m, p)."""
     size = np.linalg.norm(jacobian, axis=0)
     scaled = jacobian[:, size > 0] / size[size > 0]
+    values, vectors = np.linalg.eigh(scaled.T @ scaled)
+    if len(values) and values[0] > 1e-5 * values[-1]:  # far from dependent: squared columns lose nothing that matters
+        return np.asarray(scaled @ (vectors / np.sqrt(values)))
     U, s, _ = np.linalg.svd(scaled, full_matrices=False)
     return U[:, s > 1e-9 * s[0]] if len(s) else U
 

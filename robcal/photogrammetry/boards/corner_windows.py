@@ -11,9 +11,11 @@ from robcal.photogrammetry.boards.board_map import BoardMap
 from robcal.photogrammetry.boards.surroundings import QUADRANTS, Surroundings
 from robcal.transforms import Array
 
-_LARGEST = 20.0
+_LARGEST = 28.0
 """px; beyond it lines bend by more than the map of the board tells."""
 _BLUR = 0.8
+_BAND = 6.0
+"""px from an edge within which pixels are used."""
 _MARGIN = 2.4
 """px from foreign edges: their blur has ended there."""
 
@@ -51,7 +53,13 @@ def corner_windows(
     dy = (rows - xy[:, 1, None])[:, :, None] + np.zeros((1, 1, len(offset)))
     away = np.stack([dx, dy], axis=-1).reshape(len(xy), -1, 2)
     valid = inside.reshape(len(xy), -1) & _own(away, first, reach, around, pixels)
-    windows = CornerWindows(origin, value, valid, value >= saturation, np.zeros((len(xy), 2)), half)
+    # the pixels used moved to the front, row by row, padded with pixels that are not
+    order = np.argsort(~valid, axis=1, kind="stable")[:, : max(1, int(valid.sum(axis=1).max()))]
+    from_origin = away + (xy - origin)[:, None]
+    x, y, value, valid = (
+        np.take_along_axis(column, order, axis=1) for column in (from_origin[..., 0], from_origin[..., 1], value, valid)
+    )
+    windows = CornerWindows(origin, x, y, value, valid, value >= saturation, np.zeros((len(xy), 2)), float(half))
     normals = _normals(first)
     angle = np.arctan2(normals[..., 1], normals[..., 0])
     start = np.column_stack([xy - origin, angle, np.full(len(xy), np.log(_BLUR))])
@@ -87,6 +95,8 @@ def _own(away: Array, first: Array, reach: Array, around: Surroundings, pixels: 
     valid = (q[..., 0] > -reach[:, 0, None]) & (q[..., 0] < reach[:, 1, None])
     valid &= (q[..., 1] > -reach[:, 2, None]) & (q[..., 1] < reach[:, 3, None])
     valid &= np.abs(away).max(axis=2) <= _LARGEST
+    # far from both edges is nothing that tells of the corner
+    valid &= (np.abs(q) * pixels[:, None, ::2]).min(axis=2) < _BAND
     for k, (sx, sy) in enumerate(QUADRANTS):
         deep_x = around.depth[:, k] - _MARGIN / pixels[:, 0]
         deep_y = around.depth[:, k] - _MARGIN / pixels[:, 2]

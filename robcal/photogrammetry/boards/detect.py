@@ -139,13 +139,13 @@ def _judged(
     return right
 
 
-def _columns(ids: NDArray[np.int64], fits: CornerFits, half: int) -> dict[str, NDArray]:
+def _columns(ids: NDArray[np.int64], fits: CornerFits, half: float) -> dict[str, NDArray]:
     columns = empty_columns(len(ids))
     contrast = 2.0 * np.abs(fits.amplitude)
     return columns | {
         "xy": fits.xy,
         "covariance": fits.covariance,
-        "semi_axes": np.full((len(ids), 2), float(half)),
+        "semi_axes": np.full((len(ids), 2), half),
         "angle": fits.angle[:, 0],
         "contrast": contrast,
         "background": fits.level - 0.5 * contrast,

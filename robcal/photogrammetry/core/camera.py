@@ -1,11 +1,15 @@
 """Pinhole camera with OpenCV's radial and tangential distortion: projection, its derivatives, and the inverse.
 
+Other lenses (:mod:`robcal.photogrammetry.core.lenses`) are subclasses and register their own functions.
+
 Pixels are (x, y) with the centre of the top-left pixel at (0, 0). The camera looks along its +z, x to the right,
 y down. Source of the model: OpenCV documentation, "Camera Calibration and 3D Reconstruction" (five coefficients).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import singledispatch
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -40,15 +44,15 @@ class Camera:
 
     @property
     def vector(self) -> Array:
-        """The intrinsic parameters (9,) in the order of :data:`INTRINSIC_NAMES`."""
-        return np.array([getattr(self, name) for name in INTRINSIC_NAMES], dtype=float)
+        """The intrinsic parameters in the order of the names, (9,) those of :data:`INTRINSIC_NAMES`."""
+        return np.array([getattr(self, name) for name in self.names], dtype=float)
 
-    def with_vector(self, numbers: ArrayLike) -> "Camera":
+    def with_vector(self, numbers: ArrayLike) -> Self:
         """The same camera with other intrinsic parameters."""
         values = np.asarray(numbers, dtype=float)
-        if values.shape != (9,):
-            raise InvalidInput(f"interior orientation needs nine parameters, got shape {values.shape}")
-        return Camera(self.width, self.height, *map(float, values))
+        if values.shape != (len(self.names),):
+            raise InvalidInput(f"interior orientation needs {len(self.names)} parameters, got shape {values.shape}")
+        return replace(self, **dict(zip(self.names, values.tolist(), strict=True)))
 
     @property
     def matrix(self) -> Array:
@@ -75,6 +79,7 @@ def _distort(xn: Array, yn: Array, camera: Camera) -> tuple[Array, Array]:
     return xd, yd
 
 
+@singledispatch
 def project(camera: Camera, p_camera: ArrayLike) -> Array:
     """Image points ``(..., 2)`` in px of points ``(..., 3)`` in the camera frame.
 
@@ -87,6 +92,7 @@ def project(camera: Camera, p_camera: ArrayLike) -> Array:
     return np.stack([camera.fx * xd + camera.cx, camera.fy * yd + camera.cy], axis=-1)
 
 
+@singledispatch
 def project_with_jacobians(camera: Camera, p_camera: ArrayLike) -> tuple[Array, Array, Array]:
     """Image points, their derivatives by the point and by the interior orientation.
 
@@ -94,7 +100,7 @@ def project_with_jacobians(camera: Camera, p_camera: ArrayLike) -> tuple[Array, 
     -------
     xy : (..., 2) px.
     d_point : (..., 2, 3) px per m, by the point in the camera frame.
-    d_intrinsics : (..., 2, 9) by the numbers in the order of :data:`INTRINSIC_NAMES`.
+    d_intrinsics : (..., 2, 9) by the numbers in the order of the camera's names.
     """
     p = np.asarray(p_camera, dtype=float)
     z = np.where(p[..., 2] > 0, p[..., 2], np.nan)
@@ -143,6 +149,7 @@ def project_each(cameras: Sequence[Camera], camera: NDArray[np.integer], p_camer
     return xy, d_point, d_in
 
 
+@singledispatch
 def normalise(camera: Camera, xy: ArrayLike, iterations: int = 50) -> Array:
     """Ideal image coordinates ``(..., 2)`` (x/z, y/z) of pixels ``(..., 2)``: distortion removed by Newton steps.
 
@@ -151,7 +158,7 @@ def normalise(camera: Camera, xy: ArrayLike, iterations: int = 50) -> Array:
     pixels = np.asarray(xy, dtype=float)
     target = (pixels - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
     ideal = target.copy()
-    unit = Camera(camera.width, camera.height, 1.0, 1.0, 0.0, 0.0, *camera.distortion)
+    unit = replace(camera, fx=1.0, fy=1.0, cx=0.0, cy=0.0)
     for _ in range(iterations):
         ray = np.concatenate([ideal, np.ones_like(ideal[..., :1])], axis=-1)
         value, d_point, _ = project_with_jacobians(unit, ray)

@@ -19,7 +19,7 @@ from robcal.photogrammetry.core.bodies import Body, IntArray, line_ratio
 from robcal.photogrammetry.core.camera import Camera, project, project_each
 from robcal.photogrammetry.core.eccentricity import effective_point
 from robcal.photogrammetry.orientation.closed_form import LINE, start_poses, three_point_search
-from robcal.transforms import Array, invert, retract, skew, transform
+from robcal.transforms import Array, invert, retract, transform
 
 
 @dataclass(frozen=True)
@@ -113,6 +113,8 @@ def refine_poses(
     reference_T_body : (k, 4, 4) start values. pose : (m,) which of them each mark belongs to.
     view : the camera of all marks (its frame is the reference), or which one of several each mark is of.
     """
+    from robcal.photogrammetry.orientation.pose_loop import Rows, add_rows  # compiled: imported where it runs
+
     k = len(reference_T_body)
     rig = Rig.single(view, len(pose)) if isinstance(view, Camera) else view
     W = whitener(marks.covariance)
@@ -124,9 +126,11 @@ def refine_poses(
         camera_T_body = camera_T_reference[rig.camera[rows]] @ poses[place]
         R = camera_T_body[:, :3, :3]
         predicted, d_point, _ = project_each(rig.cameras, rig.camera[rows], mine.seen_from(camera_T_body))
-        r = np.einsum("mij,mj->mi", W[rows], mine.xy - predicted)
-        J = W[rows] @ d_point @ np.concatenate([R, -R @ skew(mine.points)], axis=-1)
-        return NormalEquations.of_rows(place, r, J, len(chosen))
+        n = len(chosen)
+        sums = NormalEquations(np.zeros((n, 6, 6)), np.zeros((n, 6)), np.zeros(n))
+        marked = Rows(place, W[rows], mine.xy - predicted, d_point, np.ascontiguousarray(R), mine.points)
+        add_rows(marked, sums.matrix, sums.right, sums.cost)
+        return sums
 
     settings = TerminationSettings(iterations, cost_tolerance=1e-8, negligible=1e-14)
     found = minimise_each(equations, _turned_little, reference_T_body, settings)

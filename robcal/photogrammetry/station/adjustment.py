@@ -6,21 +6,24 @@ of cameras and body, however many poses there are. Source of the elimination: Tr
 """
 
 from dataclasses import dataclass
-from itertools import pairwise
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
 from robcal.errors import NotIdentifiable
-from robcal.estimation.grouping import sum_by, whitener
+from robcal.estimation.grouping import whitener
 from robcal.estimation.levenberg import Linearised, levenberg
 from robcal.estimation.robust import huber_costs, huber_weights
 from robcal.estimation.summary import SolveSummary, TerminationSettings
 from robcal.photogrammetry.core.camera import INTRINSIC_NAMES, Camera, project_with_jacobians
 from robcal.photogrammetry.core.eccentricity import effective_point
 from robcal.photogrammetry.station.network import MarkTable, StationDesign, Unknowns
-from robcal.transforms import Array, invert, retract, skew
+from robcal.transforms import Array, invert, retract
+
+if TYPE_CHECKING:
+    from robcal.photogrammetry.station.adjustment_loops import Blocks, Places
 
 
 def interior_basis(interior: Array) -> Array:
@@ -81,30 +84,25 @@ def linearise(marks: MarkTable, x: Unknowns, cameras: tuple[Camera, ...], noise:
     Marks whose target comes to lie behind its camera have NaN residuals.
     """
     W = whitener(marks.covariance) / noise[marks.camera][:, None, None]
-    camera_T_world = invert(x.world_T_exterior)[marks.exterior]
-    camera_T_body = camera_T_world @ x.world_T_body[marks.pose]
+    every = invert(x.world_T_exterior)[:, None] @ x.world_T_body  # an image has one frame, its marks are many
+    camera_T_body = every[marks.exterior, marks.pose]
     R = camera_T_body[:, :3, :3]
     p_body = x.points[marks.target]
     p_camera = np.einsum("mij,mj->mi", R, p_body) + camera_T_body[:, :3, 3]
     seen = effective_point(p_camera, np.einsum("mij,mj->mi", R, marks.normals), marks.radius)
+    from robcal.photogrammetry.station.adjustment_loops import Blocks, differentiate  # compiled
+
     m = len(marks)
     r, d_point, d_in = np.empty((m, 2)), np.empty((m, 2, 3)), np.empty((m, 2, 9))
     basis = interior_basis(x.interior)
     for c, camera in enumerate(cameras):
         rows = marks.camera == c
         value, d_point[rows], by_numbers = project_with_jacobians(camera.with_vector(x.interior[c]), seen[rows])
-        d_in[rows] = by_numbers @ basis[c]
+        d_in[rows] = (by_numbers.reshape(-1, 9) @ basis[c]).reshape(-1, 2, 9)
         r[rows] = marks.xy[rows] - value
-    d_point = W @ d_point
-    by_point = d_point @ R
-    return Linearisation(
-        np.einsum("mij,mj->mi", W, r),
-        np.concatenate([-d_point, d_point @ skew(p_camera)], axis=-1),
-        W @ d_in,
-        by_point,
-        np.concatenate([by_point, -by_point @ skew(p_body)], axis=-1),
-        W,
-    )
+    blocks = Blocks(*(np.empty(shape) for shape in ((m, 2), (m, 2, 6), (m, 2, 9), (m, 2, 3), (m, 2, 6))))
+    differentiate(W, r, d_point, d_in, np.ascontiguousarray(R), p_camera, p_body, blocks)
+    return Linearisation(*blocks, W)
 
 
 @dataclass(frozen=True)
@@ -197,75 +195,61 @@ class _System:
 
 
 def _normal(lin: Linearisation, marks: MarkTable, x: Unknowns, prior: Prior, weights: Array) -> _System:
-    e, c, t, p = len(x.world_T_exterior), len(x.interior), len(x.points), len(x.world_T_body)
-    g = 6 * e + 9 * c + 3 * t
-    root = np.sqrt(weights)[:, None]
-    S = np.concatenate([lin.by_exterior, lin.by_interior], axis=-1) * root[..., None]
-    P, B = lin.by_point * root[..., None], lin.by_pose * root[..., None]
-    r = lin.residual * root
+    e, c, p = len(x.world_T_exterior), len(x.interior), len(x.world_T_body)
+    g = 6 * e + 9 * c + 3 * len(x.points)
+    from robcal.photogrammetry.station.adjustment_loops import Sums, add_marks  # compiled
+
+    sums = Sums(np.zeros((g, g)), np.zeros(g), np.zeros((g, p, 6)), np.zeros((p, 6, 6)), np.zeros((p, 6)))
+    add_marks(_blocks(lin), _places(marks, e, c), weights, sums)
     N, b, _ = _prior_terms(x, prior)
-    W = np.zeros((g, p, 6))
-    points = slice(6 * e + 9 * c, g)
-    b[points] += sum_by(marks.target, np.einsum("mki,mk->mi", P, r), t).ravel()
-    pair = marks.target * p + marks.pose
-    W[points] = sum_by(pair, _product(P, B), t * p).reshape(t, p, 3, 6).transpose(0, 2, 1, 3).reshape(3 * t, p, 6)
-    V, v = np.zeros((p, 6, 6)), np.zeros((p, 6))
-    # marks of one image have the same columns but for the point, marks of one target in one camera but for the pose
-    image = np.concatenate([S, B, r[..., None]], axis=-1)
-    for rows in _groups(marks.exterior * p + marks.pose):
-        at, k = _station_columns(marks, rows[0], e), int(marks.pose[rows[0]])
-        flat = image[rows].reshape(-1, 22)
-        products = flat.T @ flat
-        N[np.ix_(at, at)] += products[:15, :15]
-        b[at] += products[:15, 21]
-        W[at, k] += products[:15, 15:21]
-        V[k] += products[15:21, 15:21]
-        v[k] += products[15:21, 21]
-    sight = np.concatenate([S, P], axis=-1)
-    for rows in _groups(marks.exterior * t + marks.target):
-        at, first = _station_columns(marks, rows[0], e), 6 * e + 9 * c + 3 * int(marks.target[rows[0]])
-        flat = sight[rows].reshape(-1, 18)
-        products = flat[:, 15:].T @ flat
-        N[first : first + 3, at] += products[:, :15]
-        N[at, first : first + 3] += products[:, :15].T
-        N[first : first + 3, first : first + 3] += products[:, 15:]
-    return _System(N, b, W, V, v)
+    N += np.tril(sums.matrix) + np.tril(sums.matrix, -1).T
+    return _System(N, b + sums.right, sums.coupling, sums.pose_matrix, sums.pose_right)
 
 
-def _groups(key: NDArray[np.int64]) -> list[NDArray[np.int64]]:
-    """Rows (of those with the same key) group by group."""
-    order = np.argsort(key, kind="stable")
-    edges = np.flatnonzero(np.diff(key[order])) + 1
-    return [order[i:j] for i, j in pairwise([0, *edges.tolist(), len(order)])] if len(order) else []
+def _blocks(lin: "Linearisation | StationDesign") -> "Blocks":
+    from robcal.photogrammetry.station.adjustment_loops import Blocks
+
+    return Blocks(lin.residual, lin.by_exterior, lin.by_interior, lin.by_point, lin.by_pose)
 
 
-def _station_columns(marks: MarkTable, row: int, e: int) -> NDArray[np.int64]:
-    """(15,) global columns of a mark's exterior and interior unknowns."""
-    return np.concatenate([6 * marks.exterior[row] + np.arange(6), 6 * e + 9 * marks.camera[row] + np.arange(9)])
+def _places(marks: MarkTable, e: int, c: int) -> "Places":
+    from robcal.photogrammetry.station.adjustment_loops import Places
+
+    return Places(marks.exterior, marks.camera, marks.target, marks.pose, e, c)
 
 
-def _product(A: Array, B: Array) -> Array:
-    """(m, i, j) products A' B of each mark's derivatives (m, 2, i) and (m, 2, j)."""
-    return np.asarray(A[:, 0, :, None] * B[:, 0, None, :] + A[:, 1, :, None] * B[:, 1, None, :])
+@dataclass(frozen=True)
+class _Factor:
+    """Cholesky factor of a symmetric positive matrix scaled to unit diagonal."""
 
+    factor: tuple[Array, bool]
+    scale: Array
 
-def _solve_scaled(S: Array, b: Array, names: list[str]) -> tuple[Array, Array]:
-    """Solution and inverse of a symmetric positive system, scaled to unit diagonal first."""
-    scale = np.sqrt(np.maximum(np.diag(S), 1e-300))
-    unit = S / np.outer(scale, scale)
-    try:
-        factor = linalg.cho_factor(unit, lower=True)
-    except linalg.LinAlgError:
-        vectors = np.linalg.eigh(unit)[1]
-        weak = np.abs(vectors[:, 0])
-        tied = [names[i] for i in np.argsort(weak)[::-1][:4] if weak[i] > 0.2]
-        raise NotIdentifiable(
-            "the images do not determine " + ", ".join(tied) + ": add poses that are tilted and at other distances, "
-            "or give camera files and keep intrinsics fixed",
-            tied,
-        ) from None
-    inverse = linalg.cho_solve(factor, np.eye(len(S)))
-    return linalg.cho_solve(factor, b / scale) / scale, inverse / np.outer(scale, scale)
+    @classmethod
+    def of(cls, S: Array, names: list[str]) -> "_Factor":
+        """Raises NotIdentifiable, which names the unknowns, where the matrix is singular."""
+        scale = np.sqrt(np.maximum(np.diag(S), 1e-300))
+        unit = S / np.outer(scale, scale)
+        try:
+            return cls(linalg.cho_factor(unit, lower=True, check_finite=False), scale)
+        except linalg.LinAlgError:
+            vectors = np.linalg.eigh(unit)[1]
+            weak = np.abs(vectors[:, 0])
+            tied = [names[i] for i in np.argsort(weak)[::-1][:4] if weak[i] > 0.2]
+            raise NotIdentifiable(
+                "the images do not determine " + ", ".join(tied) + ": add poses that are tilted and at other "
+                "distances, or give camera files and keep intrinsics fixed",
+                tied,
+            ) from None
+
+    def solve(self, b: Array) -> Array:
+        """Solution of the system with the right side (n,)."""
+        return np.asarray(linalg.cho_solve(self.factor, b / self.scale, check_finite=False)) / self.scale
+
+    def inverse(self) -> Array:
+        """(n, n)."""
+        lower = linalg.lapack.dpotri(self.factor[0], lower=True)[0]
+        return (np.tril(lower) + np.tril(lower, -1).T) / np.outer(self.scale, self.scale)
 
 
 def unknown_names(cameras: tuple[str, ...], exterior: list[str], ids: NDArray[np.int64]) -> list[str]:
@@ -310,7 +294,7 @@ class _At:
     half_cost: float
 
 
-def adjust_station(
+def adjust_station(  # noqa: PLR0913 - options by keyword
     marks: MarkTable,
     start: Unknowns,
     cameras: tuple[Camera, ...],
@@ -343,7 +327,9 @@ def adjust_station(
 
     def system_at(here: _At) -> tuple[Linearisation, Array, _System]:
         weights = _weights(here.lin.residual, huber)
-        clean = Linearisation(*(np.where(np.isfinite(a), a, 0.0) for a in vars(here.lin).values()))
+        clean = here.lin
+        if not np.isfinite(clean.residual).all():
+            clean = Linearisation(*(np.where(np.isfinite(a), a, 0.0) for a in vars(here.lin).values()))
         return clean, weights, _normal(clean, marks, here.unknowns, prior, weights)
 
     def local(here: _At) -> Linearised[_At]:
@@ -353,7 +339,7 @@ def adjust_station(
         def propose(damping: float) -> tuple[_At, float]:
             N, b, pose_inverse = system.reduced(damping)
             step = np.zeros(len(active))
-            step[on] = _solve_scaled(N[np.ix_(on, on)], b[on], active_names)[0]
+            step[on] = _Factor.of(N[np.ix_(on, on)], active_names).solve(b[on])
             rest = system.pose_right - np.einsum("gpi,g->pi", system.coupling, step)
             pose_step = np.einsum("pij,pj->pi", pose_inverse, rest)
             saved = 0.5 * float(step @ system.right + np.sum(pose_step * system.pose_right))
@@ -365,9 +351,9 @@ def adjust_station(
     settings = TerminationSettings(max_iterations, 12, 2.0 * tolerance / max(1, len(marks)), tolerance)
     end, summary = levenberg(local, at(start), settings)
     clean, weights, system = system_at(end)
-    N, b, pose_inverse = system.reduced()
+    N, _, pose_inverse = system.reduced()
     inverse = np.zeros_like(N)
-    inverse[np.ix_(on, on)] = _solve_scaled(N[np.ix_(on, on)], b[on], active_names)[1]
+    inverse[np.ix_(on, on)] = _Factor.of(N[np.ix_(on, on)], active_names).inverse()
     design = StationDesign(
         clean.residual,
         clean.by_exterior,
@@ -396,20 +382,8 @@ def covariance_blocks(design: StationDesign, marks: MarkTable, e: int, c: int) -
     T = np.matmul(W.transpose(1, 0, 2), Vi)
     Qgp = -np.matmul(Q, T.transpose(1, 0, 2).reshape(g, 6 * p)).reshape(g, p, 6)
     Qpp = Vi - np.matmul(T.transpose(0, 2, 1), Qgp.transpose(1, 0, 2))
-    columns = global_columns(marks, e, c)
-    A = np.concatenate([design.by_exterior, design.by_interior, design.by_point], axis=-1)
-    B = design.by_pose
+    from robcal.photogrammetry.station.adjustment_loops import covariances  # compiled
+
     covariance = np.empty((len(marks), 2, 2))
-    # marks of one target in one exterior orientation have the same columns
-    group = marks.exterior * (int(marks.target.max(initial=0)) + 1) + marks.target
-    for rows in _groups(group):
-        at = columns[rows[0]]
-        own = A[rows]
-        covariance[rows] = np.matmul(
-            (own.reshape(-1, 18) @ Q[np.ix_(at, at)]).reshape(own.shape), own.transpose(0, 2, 1)
-        )
-        both = np.matmul(own, Qgp[np.ix_(at, marks.pose[rows])].transpose(1, 0, 2))
-        cross = np.matmul(both, B[rows].transpose(0, 2, 1))
-        covariance[rows] += cross + cross.transpose(0, 2, 1)
-    covariance += np.matmul(np.matmul(B, Qpp[marks.pose]), B.transpose(0, 2, 1))
+    covariances(_blocks(design), _places(marks, e, c), Q, np.ascontiguousarray(Qgp.transpose(1, 0, 2)), Qpp, covariance)
     return Qpp, np.eye(2) - covariance

@@ -108,5 +108,5 @@ def test_the_centre_of_a_picture_of_integer_pixels() -> None:
 
 
 def test_wrong_number_of_intrinsics_is_refused() -> None:
-    with pytest.raises(InvalidInput, match="nine parameters"):
+    with pytest.raises(InvalidInput, match="needs 9 parameters"):
         Camera.from_size(640, 480).with_vector([1.0, 2.0])

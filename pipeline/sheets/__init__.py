@@ -1,0 +1,1 @@
+"""Target sheets to print, and what can be read in images of them."""
