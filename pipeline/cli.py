@@ -13,6 +13,7 @@ from pipeline.cell_commands import cell
 from pipeline.command_line import CampaignPath, InstrumentName, Json, Quiet, RunFolder, Workers, answers, wrong_use
 from pipeline.drift_commands import app as drift_app
 from pipeline.fleet_commands import history, many
+from pipeline.live_commands import live_app
 from pipeline.mastering_commands import mastering
 from pipeline.messages import LOG
 from pipeline.program_commands import programs
@@ -30,6 +31,7 @@ app.add_typer(drift_app, name="drift")
 app.add_typer(mastering)
 app.add_typer(programs)
 app.add_typer(many)
+app.add_typer(live_app)
 app.add_typer(history, name="history")
 
 RunOrDrift = Annotated[

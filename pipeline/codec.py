@@ -32,7 +32,7 @@ def encode(value: Any, arrays: dict[str, np.ndarray]) -> Any:
     """Plain JSON data of a value; arrays go into ``arrays`` by key."""
     if isinstance(value, enum.Enum):  # before str and int, which an enum may also be
         return {"$": "enum", "class": _class_name(type(value)), "value": encode(value.value, arrays)}
-    if value is None or isinstance(value, bool | str):
+    if value is None or (isinstance(value, bool | str | int) and not isinstance(value, np.generic)):
         return value
     if isinstance(value, np.ndarray):
         if value.dtype == object:
@@ -42,8 +42,6 @@ def encode(value: Any, arrays: dict[str, np.ndarray]) -> Any:
         return {"$": "array", "key": key}
     if isinstance(value, np.generic):
         return encode(value.item(), arrays)
-    if isinstance(value, int):
-        return value
     if isinstance(value, float):
         return value if math.isfinite(value) else {"$": "float", "value": repr(value)}
     if dataclasses.is_dataclass(value) and not isinstance(value, type):

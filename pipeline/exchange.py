@@ -5,13 +5,19 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.campaign import Campaign
 from pipeline.mastering import keep_calibrated, measured_campaign, recording_for
-from pipeline.runs import open_run
+from pipeline.runs import Run, open_run
 from pipeline.stages.identify import load_calibrated, require_robot
-from robcal.cell.exchange import exchange, transfer
+from robcal.calibration.calibrated import CalibratedRobot
+from robcal.calibration.identifiability import repetitions
+from robcal.calibration.joint_log import JointLog
+from robcal.calibration.measurements import RobotRecording
+from robcal.cell.exchange import FEW, exchange, exchange_by_mastering, transfer
 from robcal.errors import InvalidInput, NotIdentifiable, located
 from robcal.files.poses_table import joint_columns, read_poses
 from robcal.files.tables import write_table
+from robcal.robot.model import RobotModel
 
 
 def exchange_robot(reference: Path, campaign_path: Path, out: Path, workers: int | None = None) -> dict[str, Any]:
@@ -31,6 +37,8 @@ def exchange_robot(reference: Path, campaign_path: Path, out: Path, workers: int
             f"{campaign.path}: was measured by another instrument than the reference, so in another world: measure "
             "both with the same, or with cameras of the same name that have not been moved"
         )
+    if int(repetitions(log.q, 1e-3).max(initial=-1)) + 1 < FEW:
+        return _from_few(robot, nominal, log, recording, campaign, run, out)
     try:
         found = exchange(robot, nominal, log, recording)
     except (InvalidInput, NotIdentifiable) as error:
@@ -50,6 +58,36 @@ def exchange_robot(reference: Path, campaign_path: Path, out: Path, workers: int
         "offsets_deg": offsets,
         "sigma_deg": {axis: float(np.degrees(sigma[joints[axis]])) for axis in offsets},
         "warnings": warnings,
+    }
+
+
+def _from_few(
+    robot: CalibratedRobot,
+    nominal: RobotModel,
+    log: JointLog,
+    recording: RobotRecording,
+    campaign: Campaign,
+    run: Run,
+    out: Path,
+) -> dict[str, Any]:
+    """A run of the new robot from one to three poses: zero offsets alone."""
+    try:
+        found = exchange_by_mastering(robot, nominal, log, recording)
+    except (InvalidInput, NotIdentifiable) as error:
+        raise located(error, str(campaign.path)) from None
+    keep_calibrated(run, found.robot, f"exchanged for {robot.model.name}, from campaign {campaign.name}")
+    sigma = np.sqrt(np.diag(found.covariance))
+    return {
+        "out": str(out),
+        "poses": len(log),
+        "parameters": len(found.joints),
+        "sigma0": found.sigma0,
+        "offsets_deg": {j: float(np.degrees(v)) for j, v in zip(found.joints, found.offsets, strict=True)},
+        "sigma_deg": {j: float(np.degrees(v)) for j, v in zip(found.joints, sigma, strict=True)},
+        "warnings": [
+            f"{campaign.path}: fewer than {FEW} distinct poses tell zero offsets alone: base and tool are taken from "
+            "the reference, lengths from the drawing, which the stated uncertainty holds"
+        ],
     }
 
 

@@ -21,7 +21,7 @@ from robcal.transforms import Array
 MAX_BYTES = 50_000_000
 
 
-def correct_program(
+def correct_program(  # noqa: PLR0913 - options by keyword
     folder: Path,
     program: Path,
     out: Path,

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from pipeline import artifacts
@@ -11,6 +12,7 @@ from pipeline.campaign import Campaign
 from pipeline.instruments_diagnosis import diagnose_several
 from pipeline.json_io import write_json
 from pipeline.messages import LOG
+from pipeline.runs import Run
 from pipeline.stages.base import Context, Outcome, Stage, no_files
 from pipeline.stages.identify import options_of
 from robcal.diagnosis.content import diagnosis_content, with_exchanges, with_images
@@ -64,12 +66,7 @@ def work(context: Context) -> Outcome:
     if content.get("next_poses"):
         write_table(run.next_poses, _columns(content["next_poses"]))
         outputs.append(run.next_poses)
-    if found.relative is not None:
-        outputs.append(run.save(artifacts.RELATIVE_COVARIANCE, found.relative))
-    if found.corrected is not None:
-        outputs.append(run.save(artifacts.CORRECTED, found.corrected))
-    if found.placed is not None:
-        outputs.append(run.save(artifacts.PLACED, found.placed))
+    outputs += _optional(run, found)
     told = [f.statement for f in images.findings] + [f.told for f in diagnosis.findings]
     told = [f"targets {x.targets[0]} and {x.targets[1]} exchanged in {len(x.poses)} pose(s)" for x in exchanges] + told
     notes = told or ["nothing missing: the model explains the data"]
@@ -80,6 +77,18 @@ def work(context: Context) -> Outcome:
     swapped = [{"cause": TARGET_SWAPPED.name, "where": str(x.targets[0]), "direction": None} for x in exchanges]
     outcome["causes"] = [*swapped, *_named(images.findings), *_result(diagnosis)["causes"]]
     return Outcome({"diagnosis": outcome}, outputs, notes)
+
+
+def _optional(run: Run, found: RobotDiagnosis) -> list[Path]:
+    """What only some diagnoses leave behind."""
+    outputs = []
+    if found.relative is not None:
+        outputs.append(run.save(artifacts.RELATIVE_COVARIANCE, found.relative))
+    if found.corrected is not None:
+        outputs.append(run.save(artifacts.CORRECTED, found.corrected))
+    if found.placed is not None:
+        outputs.append(run.save(artifacts.PLACED, found.placed))
+    return outputs
 
 
 def _in_force(found: RobotDiagnosis) -> dict[str, Any]:

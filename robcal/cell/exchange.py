@@ -16,6 +16,7 @@ from robcal.calibration.identification import IdentifiedRobot, IdentifyOptions
 from robcal.calibration.joint_log import JointLog
 from robcal.calibration.measurements import RobotRecording
 from robcal.calibration.variance_components import identify_recording
+from robcal.cell.mastering import Mastering, master
 from robcal.errors import InvalidInput
 from robcal.robot.compensation import Compensation, compensate
 from robcal.robot.kernel import Kernel
@@ -24,6 +25,10 @@ from robcal.transforms import Array, difference, transport_covariance
 
 LEAST_LENGTH, LEAST_ANGLE = 5e-5, 5e-5
 """Smallest scatter (m, rad) that deviations of robots are taken to have."""
+PLACED = (5e-4, 5e-4)
+"""m and rad: how alike two robots of a type stand on the same foundation and hold the same tool."""
+FEW = 4
+"""Fewer distinct poses than these do not tell base and tool from the zero offsets."""
 BELOW_LIMIT = 1.9e-3
 """Largest scatter (m, rad): beyond it a reference robot is no type but a damaged one."""
 
@@ -57,22 +62,9 @@ def exchange(
     ------
     InvalidInput : a robot of another type. NotIdentifiable : too few measurements for base, tool and zero offsets.
     """
-    if [(f.name, f.axis, f.xyz, f.rpy) for f in nominal.frames] != [
-        (f.name, f.axis, f.xyz, f.rpy) for f in reference.model.frames
-    ]:
-        raise InvalidInput(
-            f"robot '{nominal.name}' is of another type than the reference '{reference.model.name}': frames differ"
-        )
+    start = _start(reference, nominal)
     known = reference.model.parameters
-    shared = {n: v for n, v in known.items() if ".elastic_" in n or n.startswith(("payload.", "gravity."))}
-    start = replace(
-        nominal.with_parameters({**nominal.parameters, **shared}),
-        payloads=reference.model.payloads,
-        world_T_base=reference.model.world_T_base,
-        flange_T_tool=reference.model.flange_T_tool,
-    )
-    zeros = [f"{f.name}.{f.joint_kind}" for f in nominal.joints]
-    others = [f"{f.name}.{k}" for f in nominal.frames for k in GEOMETRIC_KINDS if f"{f.name}.{k}" not in zeros]
+    zeros, others = _geometry(nominal)
     options = IdentifyOptions(
         parameters=(*zeros, *others),
         statics=reference.statics,
@@ -86,6 +78,64 @@ def exchange(
     inputs = log.inputs(kernel)
     found, _ = identify_recording(start, inputs, recording, np.arange(len(log)), options, kernel)
     return found.with_recording(log, nominal)
+
+
+def exchange_by_mastering(
+    reference: CalibratedRobot, nominal: RobotModel, log: JointLog, recording: RobotRecording
+) -> Mastering:
+    """A new robot of the reference's type from too few poses for its base and tool: one is enough.
+
+    Zero offsets alone are fitted. Base and tool are the reference's, as well as robots stand on one foundation and hold
+    one tool; the geometry is the drawing's, with the scatter of the type. What that leaves open is in the covariance.
+
+    Raises
+    ------
+    InvalidInput : a robot of another type. NotIdentifiable : the measurements tell no offset.
+    """
+    start = _start(reference, nominal)
+    _, others = _geometry(nominal)
+    ends = [f"{end}.{kind}" for end in ("base", "tool") for kind in GEOMETRIC_KINDS]
+    scatter = type_scatter(reference.model.parameters, others)
+    sizes = np.array([*(scatter[n] for n in others), *np.tile(np.repeat(PLACED, 3), 2)])
+    believed = CalibratedRobot(
+        model=start,
+        names=(*others, *ends),
+        covariance=np.diag(sizes**2),
+        joint_sigma=reference.joint_sigma,
+        statics=reference.statics,
+        nominal=nominal,
+    )
+    return master(believed, log, recording.observations, stated=recording.stated)
+
+
+def _start(reference: CalibratedRobot, nominal: RobotModel) -> RobotModel:
+    """The nominal robot with what it has in common with the reference: elasticities, loads, base and tool.
+
+    Raises
+    ------
+    InvalidInput : a robot of another type.
+    """
+    if [(f.name, f.axis, f.xyz, f.rpy) for f in nominal.frames] != [
+        (f.name, f.axis, f.xyz, f.rpy) for f in reference.model.frames
+    ]:
+        raise InvalidInput(
+            f"robot '{nominal.name}' is of another type than the reference '{reference.model.name}': frames differ"
+        )
+    known = reference.model.parameters
+    shared = {n: v for n, v in known.items() if ".elastic_" in n or n.startswith(("payload.", "gravity."))}
+    return replace(
+        nominal.with_parameters({**nominal.parameters, **shared}),
+        payloads=reference.model.payloads,
+        world_T_base=reference.model.world_T_base,
+        flange_T_tool=reference.model.flange_T_tool,
+    )
+
+
+def _geometry(nominal: RobotModel) -> tuple[list[str], list[str]]:
+    """Names of the joints' zeros and of all other geometric parameters."""
+    zeros = [f"{f.name}.{f.joint_kind}" for f in nominal.joints]
+    others = [f"{f.name}.{k}" for f in nominal.frames for k in GEOMETRIC_KINDS if f"{f.name}.{k}" not in zeros]
+    return zeros, others
 
 
 def type_scatter(deviations: Mapping[str, float], names: list[str]) -> dict[str, float]:

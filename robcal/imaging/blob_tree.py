@@ -324,7 +324,7 @@ def _keep_rest(image, pixels, core, base, least, depth, stack):  # type: ignore[
 
 
 @inner
-def _cut(image, pixels, base, depth, max_depth, stack, refused, found, hits):  # type: ignore[no-untyped-def]
+def _cut(image, pixels, base, depth, max_depth, stack, refused, found, hits):  # type: ignore[no-untyped-def]  # noqa: PLR0913
     """Cuts one part half way between its base and its peak; returns the rows of dots and their number."""
     grey, mark, n = image.grey, image.mark, len(pixels)
     box = np.zeros(4, np.int64)

@@ -163,7 +163,7 @@ def _block(parameters, spot, pixels, begin, m, table):  # type: ignore[no-untype
 
 
 @inner
-def _system(parameters, spot, pixels, count, first, noise, priors, table, system):  # type: ignore[no-untyped-def]
+def _system(parameters, spot, pixels, count, first, noise, priors, table, system):  # type: ignore[no-untyped-def]  # noqa: PLR0913
     """Normal equations with priors in the lower triangle of `system` (13, 13), its last entry the cost.
 
     With `first` the precision of the used pixels (those with any) is set to what the noise model says of their model.
@@ -242,7 +242,7 @@ def _limit(step, parameters, radius):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _minimise(parameters, spot, pixels, count, noise, priors, rule, table, best):  # type: ignore[no-untyped-def]
+def _minimise(parameters, spot, pixels, count, noise, priors, rule, table, best):  # type: ignore[no-untyped-def]  # noqa: PLR0913
     """One dot: parameters, the system `best` and the residuals change in place; returns convergence.
 
     `priors`: ln s, its precision, shading, radius, number of pixels used. `rule` as in :func:`minimise_all`.

@@ -63,7 +63,7 @@ def _thin(upper, distance, edge, valid):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def gather_pixels(image, corners, shapes, scales, half, neighbours, x, y, value):  # type: ignore[no-untyped-def]
+def gather_pixels(image, corners, shapes, scales, half, neighbours, x, y, value):  # type: ignore[no-untyped-def]  # noqa: PLR0913
     """Places from the window's middle and grey values of the pixels to fit, into the front of x, y, value (n, p).
 
     Parameters

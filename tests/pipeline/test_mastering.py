@@ -194,10 +194,30 @@ def test_exchange_and_transfer(by_frames: tuple[Path, Path, Truth], tmp_path: Pa
     assert "taught.csv, row 5: q2_deg" in answer["error"]
 
 
+def test_one_pose_exchanges_a_robot_within_what_it_states(by_frames: tuple[Path, Path, Truth], tmp_path: Path) -> None:
+    _, run, truth = by_frames
+    every = truth.recorded.q
+    new = recorded(by_frames, tmp_path / "c", every[:1])
+    told = run_command("exchange", run, new, "--out", tmp_path / "new")
+    assert (told["poses"], told["parameters"]) == (1, 6)
+    found = np.array([told["offsets_deg"][a] for a in AXES])
+    sigma = np.array([told["sigma_deg"][a] for a in AXES])
+    assert np.all(np.abs(found - np.degrees(OFFSETS)) < 3.0 * sigma)
+    assert "tell zero offsets alone" in told["warnings"][0]
+    write_csv(tmp_path / "taught.csv", {"pose": list(map(str, range(30))), **joint_columns(every[20:50])})
+    taught = ("--poses", tmp_path / "taught.csv", "--out", tmp_path / "q.csv")
+    run_command("transfer", tmp_path / "new", "--from", run, *taught)
+    table = read_table(tmp_path / "q.csv")
+    q = np.radians(np.column_stack([table.numbers(f"q{k}_deg") for k in range(1, 7)]))
+    wanted = truth.robot.world_T_tool(every[20:50])
+    after = 1e3 * np.linalg.norm((truth.robot.world_T_tool(q + OFFSETS) - wanted)[:, :3, 3], axis=1)
+    before = 1e3 * np.linalg.norm((truth.robot.world_T_tool(every[20:50] + OFFSETS) - wanted)[:, :3, 3], axis=1)
+    assert after.mean() < 0.3 * before.mean()
+    assert 0.2 < np.sqrt(np.mean((after / table.numbers("sigma_mm")) ** 2)) < 2.0
+
+
 def test_bad_exchanges(by_frames: tuple[Path, Path, Truth], tmp_path: Path) -> None:
     campaign, run, truth = by_frames
-    two = recorded(by_frames, tmp_path / "two", truth.recorded.q[:1])
-    assert "poses are alike: nothing" in run_command("exchange", run, two, "--out", tmp_path / "o1")["error"]
     other = recorded(by_frames, tmp_path / "other", truth.recorded.q[:12])
     edit_yaml(other / "robot.yaml", lambda d: d["frames"][2].update(xyz_mm=[1300.0, 0.0, 0.0]))
     told = run_command("exchange", run, other, "--out", tmp_path / "o2")

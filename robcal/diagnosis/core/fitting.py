@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -163,19 +164,7 @@ def fit(
     theta = np.array(kernel.theta0, dtype=float)
     direct = [item for item in accepted if isinstance(item.cause, ObservationCause)]
     obs = recording.observations
-
-    def linearised() -> tuple[Array, Array, Array]:
-        frames, J = kernel.frames_and_jacobian(theta, inputs, columns=columns)
-        residual, jacobian = recording.linearise(frames, J)
-        if direct:
-            data = observation_data(recording, frames, kernel.variables(theta, inputs))
-            shifts = [
-                item.cause.observation_shift(data, item.constants)
-                for item in direct
-                if isinstance(item.cause, ObservationCause)
-            ]
-            jacobian = np.concatenate([jacobian, *(recording.whiten(shift, frames) for shift in shifts)], axis=1)
-        return frames, residual, jacobian
+    linearised = partial(_linearised, kernel, recording, inputs, columns, direct)
 
     width = len(names) + sum(len(item.names) for item in direct)
     brake = np.diag(damping(names, width, kernel.variables(theta, inputs)))[: len(names)]
@@ -185,7 +174,7 @@ def fit(
     scale, room = 0.0, 1.0
     best: tuple[float, Array, Array, Array] | None = None
     for _ in range(iterations):
-        _, residual, jacobian = linearised()
+        _, residual, jacobian = linearised(theta)
         cost = _least(residual, jacobian[:, len(columns) :])
         if best is None or cost <= best[0]:
             # as long as steps keep their promise the damping fades, and the last ones are undamped
@@ -208,7 +197,7 @@ def fit(
         theta[columns] += step
         if float(np.sum((jacobian[:, : len(columns)] @ step) ** 2)) < 1e-6:
             break
-    frames, residual, jacobian = linearised()
+    frames, residual, jacobian = linearised(theta)
     # displacements of observations are linear: their amplitudes follow from the last linear problem
     linear = solve(jacobian, residual)[len(columns) :] if direct else np.zeros(0)
     residual = residual - jacobian[:, len(columns) :] @ linear
@@ -233,8 +222,25 @@ def fit(
     )
 
 
+def _linearised(
+    kernel: Kernel, recording: Recording, inputs: PoseInputs, columns: Array, direct: Sequence[Accepted], theta: Array
+) -> tuple[Array, Array, Array]:
+    """Frames, whitened residuals (m,) and Jacobian (m, p) by the parameters ``columns``, then by observation causes."""
+    frames, J = kernel.frames_and_jacobian(theta, inputs, columns=columns)
+    residual, jacobian = recording.linearise(frames, J)
+    if direct:
+        data = observation_data(recording, frames, kernel.variables(theta, inputs))
+        shifts = [
+            item.cause.observation_shift(data, item.constants)
+            for item in direct
+            if isinstance(item.cause, ObservationCause)
+        ]
+        jacobian = np.concatenate([jacobian, *(recording.whiten(shift, frames) for shift in shifts)], axis=1)
+    return frames, residual, jacobian
+
+
 def _least(residual: Array, columns: Array) -> float:
-    """sum of squares (of whitened rows) that is left beside displacements of observations."""
+    """Sum of squares (of whitened rows) that is left beside displacements of observations."""
     left = residual - columns @ solve(columns, residual) if columns.shape[1] else residual
     return float(left @ left)
 

@@ -79,7 +79,7 @@ class _Accepted:
     heldout_px: tuple[float, float]
 
 
-def diagnose_images(data: ImageData, *, moves: bool = True, level: float = LEVEL, seed: int = 0) -> ImageDiagnosis:
+def diagnose_images(data: ImageData, *, moves: bool = True, level: float = LEVEL, seed: int = 0) -> ImageDiagnosis:  # noqa: PLR0915 - one search, step by step
     """Find what the model of the images leaves out.
 
     Weakness: everything is linear in the parameters of a cause; a strong effect is right in kind and place, its
@@ -141,16 +141,18 @@ def diagnose_images(data: ImageData, *, moves: bool = True, level: float = LEVEL
         predicted = after
         added = np.concatenate([added, basis], axis=1)
     findings = [f for item in _together(accepted, data, residual) for f in _findings(item)]
-    left_over = min(last_p, dropped_p)
+    findings, left_over = _believable(findings, min(last_p, dropped_p))
+    p_value = findings[0].p_value if findings else last_p
+    return ImageDiagnosis(tuple(findings), p_value, left_over, (before, predicted, data.sigma_px))
+
+
+def _believable(findings: list[ImageFinding], left_over: float) -> tuple[list[ImageFinding], float]:
+    """Findings that what is left over does not call into question, and the p-value of what is left over then."""
     if left_over < ADEQUATE:
         # images that are bent in a manner which nothing explains make single targets look displaced
         findings = [f for f in findings if f.kind.moves != "target" or f.p_value < left_over]
     classed = _moving_alike(findings)
-    left_over = min([left_over, *(f.p_value for f in classed)])
-    findings = [f for f in findings if f not in classed]
-    floor = data.sigma_px
-    p_value = findings[0].p_value if findings else last_p
-    return ImageDiagnosis(tuple(findings), p_value, left_over, (before, predicted, floor))
+    return [f for f in findings if f not in classed], min([left_over, *(f.p_value for f in classed)])
 
 
 def _moving_alike(findings: Sequence[ImageFinding]) -> list[ImageFinding]:

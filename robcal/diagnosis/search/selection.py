@@ -90,7 +90,7 @@ class Selection:
 DEFAULTS = SelectionSettings()
 
 
-def select(
+def select(  # noqa: PLR0915 - one search, step by step
     model: RobotModel,
     recording: Recording,
     free: tuple[str, ...],

@@ -27,7 +27,7 @@ from robcal.photogrammetry.core.network import CameraNetwork, ImageMarks, IntArr
 from robcal.transforms import Array
 
 
-def adjust(
+def adjust(  # noqa: PLR0913 - options by keyword
     marks: ImageMarks,
     camera: Camera,
     camera_T_body0: Array,

@@ -294,7 +294,7 @@ class _At:
     half_cost: float
 
 
-def adjust_station(
+def adjust_station(  # noqa: PLR0913 - options by keyword
     marks: MarkTable,
     start: Unknowns,
     cameras: tuple[Camera, ...],

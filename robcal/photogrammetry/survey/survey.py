@@ -84,7 +84,7 @@ def _identified(image: SurveyImage, body: Body, camera: Camera, error: float) ->
     return found.rows, found.ids
 
 
-def survey_body(
+def survey_body(  # noqa: PLR0913 - options by keyword
     images: Sequence[SurveyImage],
     targets: Sequence[BodyTarget],
     *,

@@ -1,0 +1,1 @@
+"""A measurement campaign driven over the network: poses out, measurements in."""
