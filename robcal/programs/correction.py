@@ -169,8 +169,8 @@ def _believed(
         if target.literal.T is None:
             if np.any(chain.prismatic & ~_track(chain)):
                 raise Refusal(
-                    f"{target.file}, line {target.line}: joint targets of an arm with sliding joints are not corrected, "
-                    "Cartesian ones are; nothing was written"
+                    f"{target.file}, line {target.line}: joint targets of an arm with a sliding joint are refused, "
+                    "Cartesian ones are corrected; nothing was written"
                 )
             q[row] = _joint_values(target, chain, np.asarray(target.literal.axes))
             wanted[row] = forward(chain, q[row][None])[0] @ tools[row]
