@@ -148,7 +148,7 @@ POINTS = "pose,target,x_mm,y_mm,z_mm,sigma_mm\np1,17,1,2,3,0.1\np2,23,4,5,6,0.2\
 MARKS = "image,target,x_px,y_px,sigma_px\na,17,1.5,2.5,0.1\na,23,3,4,0.1\n"
 FOREIGN = "head\nNr;X;Y;Z;a;b;c;d\np1;1,5;2;3;1;0;0;0\np2;1;2;3;0;1;0;0\n"
 KUKA = "DECL E6AXIS XP1={A1 1.0,A2 -90.5,A3 2,A4 3,A5 4,A6 5,E1 0.0}\nPTP {A1 1,A2 2,A3 3,A4 4,A5 5,A6 6}\n"
-ABB = "CONST jointtarget p1:=[[1,2,3,4,5,6],[9E9,9E9,9E9,9E9,9E9,9E9]];\nMoveAbsJ [[1,2,3,4,5,7],[9E9,9E9,9E9,9E9,9E9,9E9]]\n"
+ABB = "CONST jointtarget p1:=[[1,2,3,4,5,6],[9E9,9E9]];\nMoveAbsJ [[1,2,3,4,5,7],[9E9,9E9]]\n"
 SCRIPT = "global W_q=[0.1, -1.5, 1, 0, 0, 0]\nmovej([0, 0, 0, 0, 0, 1], a=1.2)\n"
 RTDE = (
     "timestamp "

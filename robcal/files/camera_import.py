@@ -187,7 +187,7 @@ def _metashape(path: Path, text: str) -> Camera:
         raise InvalidInput(f"{path}: width, height or f is missing: export the calibration as Metashape's own XML")
     if extra := [name for name in ("k4", "b2") if values[name] != 0.0]:
         raise InvalidInput(f"{path}: {', '.join(extra)} has no counterpart here: adjust without it")
-    if not all(np.isfinite(v) for v in values.values()) or not 1 <= min(values["width"], values["height"]):
+    if not all(np.isfinite(v) for v in values.values()) or min(values["width"], values["height"]) < 1:
         raise InvalidInput(f"{path}: width, height and all coefficients must be finite, the size at least one pixel")
     if max(values["width"], values["height"]) > _MOST_PIXELS:
         raise InvalidInput(f"{path}: an image side of more than {_MOST_PIXELS} pixels: check width and height")
