@@ -76,7 +76,8 @@ def _body(folder: Path, text: str) -> Path:
 
 
 def test_a_body_file_states_its_ring_codes(tmp_path: Path) -> None:
-    text = "ring: {inner: 1.6, outer: 2.5, direction: counterclockwise}\ntargets: [{id: 7, code: ring14, xyz_mm: [1, 2, 3]}]\n"
+    ring = "ring: {inner: 1.6, outer: 2.5, direction: counterclockwise}\n"
+    text = f"{ring}targets: [{{id: 7, code: ring14, xyz_mm: [1, 2, 3]}}]\n"
     file = read_body(_body(tmp_path, text))
     check_ring_codes(file)
     settings = detection_settings(file, None)
