@@ -29,8 +29,8 @@ def calibrated(tmp_path_factory):  # type: ignore[no-untyped-def]
     return folder
 
 
-@pytest.mark.parametrize("poses", [1, 8])
-def test_one_camera_masters_all_joints(calibrated: Path, tmp_path: Path, poses: int) -> None:
+@pytest.mark.parametrize(("command", "poses"), [("master", 1), ("master", 8), ("exchange", 1)])
+def test_one_camera_tells_the_zeros_of_all_joints(calibrated: Path, tmp_path: Path, command: str, poses: int) -> None:
     folder = tmp_path / "new"
     shutil.copytree(calibrated / "campaign", folder)
     camera = calibrated / "run" / "cameras" / "left.yaml"
@@ -54,11 +54,11 @@ def test_one_camera_masters_all_joints(calibrated: Path, tmp_path: Path, poses: 
 
     edit_rows(folder / "poses.csv", indicated)
     edit_rows(folder / "left.csv", of_these)
-    words = ["master", calibrated / "run", folder, "--out", tmp_path / "out", "--json", "-q"]
+    words = [command, calibrated / "run", folder, "--out", tmp_path / "out", "--json", "-q"]
     done = CliRunner().invoke(app, [str(w) for w in words])
     assert done.exit_code == 0, done.output
     answer = json.loads(done.stdout.splitlines()[-1])
     found = np.array([answer["offsets_deg"][a] for a in AXES])
     sigma = np.array([answer["sigma_deg"][a] for a in AXES])
     assert np.all(np.abs(found - OFFSETS_DEG) < 4.0 * sigma)
-    assert sigma.max() < 0.05
+    assert sigma.max() < (0.05 if command == "master" else 0.3)
