@@ -76,15 +76,22 @@ def _opencv_entries(path: Path, text: str) -> dict[str, Any]:
         storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         root = storage.root()
         return {key: _value(root.getNode(key)) for key in root.keys()}  # noqa: SIM118 (no mapping)
-    except (cv2.error, SystemError) as error:
+    except (cv2.error, SystemError, ValueError) as error:
         raise InvalidInput(f"{path}: not a file that OpenCV wrote: {' '.join(str(error).split())[:200]}") from None
 
 
 def _value(node: cv2.FileNode) -> Any:
     if node.isMap():
-        return node.mat()
+        # not node.mat(): it writes beyond its memory where rows, cols and data contradict each other
+        numbers = node.getNode("data")
+        if numbers.empty() or not numbers.isSeq():
+            raise ValueError("a matrix without data")
+        return {"data": _value(numbers)}
     if node.isSeq():
-        return [node.at(k).real() for k in range(node.size())]
+        items = [node.at(k) for k in range(node.size())]
+        return [item.real() if item.isReal() or item.isInt() else float("nan") for item in items]
+    if node.empty() or node.isNone():
+        return None
     return node.string() if node.isString() else node.real()
 
 
