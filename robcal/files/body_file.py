@@ -263,11 +263,13 @@ def check_ring_codes(body: BodyFile) -> None:
         raise InvalidInput(faults[0], faults)
 
 
-def write_body(path: Path | str, body: Body, comment: str = "", board: Board | None = None) -> None:
+def write_body(
+    path: Path | str, body: Body, comment: str = "", board: Board | None = None, ring: RingPattern = RING12
+) -> None:
     """Write a body with its coordinates atomically.
 
     ``sigma_mm`` is written for x, y and z apart; the full covariance has its place in the stage's cache. Coordinates of
-    a ``board`` stand beside its layout.
+    a ``board`` stand beside its layout; ``ring``: how its ring codes are printed.
     """
     sigma = None
     if body.covariance is not None:
@@ -287,6 +289,9 @@ def write_body(path: Path | str, body: Body, comment: str = "", board: Board | N
         data["board"] = board_entry(board)
     if body.polarity != ("bright" if board is None else "dark"):
         data["polarity"] = body.polarity
+    if (ring.inner, ring.outer, ring.clockwise) != (RING12.inner, RING12.outer, RING12.clockwise):
+        direction = "clockwise" if ring.clockwise else "counterclockwise"
+        data["ring"] = FlowMapping(inner=ring.inner, outer=ring.outer, direction=direction)
     data["targets"] = targets
     write_text(Path(path), yaml_text(data, comment))
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from robcal.errors import InvalidInput
-from robcal.files.body_file import check_ring_codes, read_body
+from robcal.files.body_file import body_from_file, check_ring_codes, read_body, write_body
 from robcal.imaging.detect import detect_targets
 from robcal.imaging.ring_code import RingPattern, canonical_id, ring_segments
 from robcal.imaging.settings import DetectionSettings
@@ -76,12 +76,15 @@ def _body(folder: Path, text: str) -> Path:
 
 
 def test_a_body_file_states_its_ring_codes(tmp_path: Path) -> None:
-    text = "ring: {inner: 1.6, outer: 2.5, direction: counterclockwise}\ntargets: [{id: 7, code: ring14}]\n"
+    ring = "ring: {inner: 1.6, outer: 2.5, direction: counterclockwise}\n"
+    text = f"{ring}targets: [{{id: 7, code: ring14, xyz_mm: [1, 2, 3]}}]\n"
     file = read_body(_body(tmp_path, text))
     check_ring_codes(file)
     settings = detection_settings(file, None)
     assert settings.ring == RingPattern(14, 1.6, 2.5, clockwise=False)
     assert settings.known_codes == frozenset({7})
+    write_body(tmp_path / "again.yaml", body_from_file("b", file), ring=file.ring)
+    assert read_body(tmp_path / "again.yaml").ring == file.ring
     assert ring_segments("ring14") == 14
     assert ring_segments("aruco:4X4_50") is None
 
