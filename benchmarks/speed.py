@@ -1,6 +1,6 @@
 """This version against an earlier one in one run: detection, the stages of a whole campaign, memory; same results?
 
-    python -m benchmarks.speed --old TREE [--images 12] [--rounds 3] [--campaigns 1] [--survey-images 60] [--poses 80]
+    python -m benchmarks.speed --old TREE [--images 12] [--rounds 3] [--orientations 1] [--campaigns 1] [--poses 80]
 
 The campaign of ``benchmarks.full_campaign`` is rendered once. Detection: each version is one process; image by image
 they take turns, so that a machine that slows down meanwhile slows both; of every image the shortest processor time of
@@ -14,6 +14,7 @@ import argparse
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -133,6 +134,49 @@ def detection_table(trees: dict[str, Path], images: Sequence[Path], rounds: int)
     )
 
 
+_ORIENT = """
+import sys, time
+from pathlib import Path
+from pipeline.campaign import read_campaign
+from pipeline.runs import Run
+from pipeline.stages import orient
+from pipeline.stages.base import Context
+context = Context(read_campaign(Path(sys.argv[1])), Run(Path(sys.argv[2])), 1)
+begin = time.process_time()
+orient.work(context)
+print(time.process_time() - begin)
+"""
+
+
+def orientation_table(trees: dict[str, Path], folder: Path, rounds: int) -> None:
+    """Prints processor seconds of the stage that orients the station, on copies of a run of the new version."""
+    if not (folder / "run").is_dir():
+        raise SystemExit(f"{folder / 'run'}: run the campaign once first (--campaigns 1)")
+    best: dict[str, float] = {}
+    for _ in range(rounds):
+        for name, tree in trees.items():
+            with tempfile.TemporaryDirectory() as scratch:
+                run = Path(shutil.copytree(folder / "run", Path(scratch) / "run"))
+                environment = {**os.environ, "PYTHONPATH": str(tree), "OMP_NUM_THREADS": "1"}
+                command = [sys.executable, "-c", _ORIENT, str((folder / "campaign").resolve()), str(run)]
+                done = subprocess.run(
+                    command,
+                    env={**environment, "OPENBLAS_NUM_THREADS": "1"},
+                    cwd=tree,
+                    capture_output=True,
+                    text=True,
+                    check=False,
+                )
+            if done.returncode:
+                raise SystemExit(f"{tree}: the orientation fails: {done.stderr.strip()[-500:]}")
+            took = float(done.stdout.split()[-1])
+            best[name] = min(took, best.get(name, took))
+    print(
+        f"\n| processor seconds | old | new | old / new |\n|---|---|---|---|\n"
+        f"| orientation of the station | {best['old']:.2f} | {best['new']:.2f} | {best['old'] / best['new']:.2f} |"
+    )
+
+
 def campaign_table(trees: dict[str, Path], cache: Path, rounds: int, survey_images: int, poses: int) -> None:
     """Prints seconds by stage and peak memory of ``benchmarks.full_campaign`` in both versions."""
     pattern = BENCHMARKS["full_campaign"].line
@@ -163,6 +207,7 @@ def main() -> None:
     parser.add_argument("--new", type=Path, default=Path.cwd(), help="this version's; default the current folder")
     parser.add_argument("--images", type=int, default=12, help="images whose targets are detected; 0: none")
     parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--orientations", type=int, default=0, help="orientations of the station by each version")
     parser.add_argument("--campaigns", type=int, default=1, help="runs of the campaign by each version; 0: none")
     parser.add_argument("--survey-images", type=int, default=60)
     parser.add_argument("--poses", type=int, default=80)
@@ -175,6 +220,8 @@ def main() -> None:
     every = sorted((folder / "campaign").resolve().rglob("*.png"))
     if given.images:
         detection_table(trees, every[:: max(1, len(every) // given.images)][: given.images], given.rounds)
+    if given.orientations:
+        orientation_table(trees, folder, given.orientations)
     if given.campaigns:
         campaign_table(trees, given.cache, given.campaigns, given.survey_images, given.poses)
 

@@ -177,7 +177,7 @@ def _on_cluster(tasks: Sequence[Task], address: str) -> Iterator[dict[str, Any]]
         futures = {
             submit(run_one, task, key=f"robcal-{k}-{task.run}", pure=False): task for k, task in enumerate(tasks)
         }
-        for future in completed(list(futures)):
+        for future in completed(list(futures), loop=client.loop):
             try:
                 yield future.result()
             except KilledWorker:

@@ -10,6 +10,8 @@ from robcal.files.robot_file import PayloadEntry
 from robcal.files.schemas import Entry, NotNegative, Positive, Text, Triple, Whole
 
 FORMAT = "robcal/campaign-1"
+RESERVED = {"CON", "PRN", "AUX", "NUL", *(f"{port}{k}" for port in ("COM", "LPT") for k in range(1, 10))}
+"""Names of devices, which Windows takes for no file."""
 
 
 def _folder_name(value: Any) -> Any:
@@ -17,6 +19,8 @@ def _folder_name(value: Any) -> Any:
     usable = text.strip() and text.isprintable() and not any(c in text for c in "/\\")
     if not usable or text in {".", ".."} or len(text) > 120:
         raise ValueError(f"must be a plain name without slashes (it names the run folder), found {text[:60]!r}")
+    if text[-1] in ". " or text.split(".")[0].strip().upper() in RESERVED:
+        raise ValueError(f"{text!r} cannot be a folder on Windows (a device's name, or a dot or blank at the end)")
     return text
 
 

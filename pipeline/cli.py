@@ -10,18 +10,27 @@ from typing import Annotated, Any
 import typer
 
 from pipeline.cell_commands import cell
-from pipeline.command_line import CampaignPath, InstrumentName, Json, Quiet, RunFolder, Workers, answers, wrong_use
+from pipeline.command_line import (
+    INTERRUPTED,
+    CampaignPath,
+    InstrumentName,
+    Json,
+    Quiet,
+    RunFolder,
+    Workers,
+    answers,
+    wrong_use,
+)
 from pipeline.drift_commands import app as drift_app
 from pipeline.fleet_commands import history, many
 from pipeline.live_commands import live_app
 from pipeline.mastering_commands import mastering
-from pipeline.messages import LOG
+from pipeline.messages import LOG, keep_libraries_silent
 from pipeline.program_commands import programs
 
 app = typer.Typer(
     name="pipeline",
     no_args_is_help=True,
-    add_completion=False,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
     help="From photographs to an accurate robot: survey, measurement, identification, diagnosis, compensation.",
@@ -38,6 +47,23 @@ RunOrDrift = Annotated[
     Path, typer.Argument(metavar="RUN", help="Run folder of a finished campaign, or state of a drift control.")
 ]
 AtCycle = Annotated[int | None, typer.Option("--at-cycle", help="Of a drift control: the model of an earlier cycle.")]
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        typer.echo(f"robcal {version('robcal')}")
+        raise typer.Exit
+
+
+@app.callback()
+def about(
+    version: Annotated[
+        bool, typer.Option("--version", help="Say the version and end.", callback=_version, is_eager=True)
+    ] = False,
+) -> None:
+    """From photographs to an accurate robot: survey, measurement, identification, diagnosis, compensation."""
 
 
 def _check_stages(start: str | None, until: str | None) -> None:
@@ -61,9 +87,14 @@ def _summary(done: Any) -> dict[str, Any]:
 @app.command(short_help="All stages that the campaign has input for.")
 def run(
     campaign: CampaignPath,
-    out: Annotated[Path | None, typer.Option("--out", help="Run folder; default runs/<campaign name>.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Run folder; default runs/<campaign name> beside the campaign.")
+    ] = None,
     until: Annotated[str | None, typer.Option("--until", metavar="STAGE", help="Last stage to run.")] = None,
     start: Annotated[str | None, typer.Option("--from", metavar="STAGE", help="First stage to run again.")] = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Say what would run, from what, and about how long it takes; do nothing.")
+    ] = False,
     workers: Workers = None,
     quiet: Quiet = False,
     as_json: Json = False,
@@ -74,6 +105,13 @@ def run(
     """
     with answers("run", as_json, quiet) as answer:
         _check_stages(start, until)
+        if dry_run:
+            from pipeline.dry_run import plan_data, plan_lines, plan_run
+
+            answer.update(plan_data(*plan_run(campaign, out, until, start, workers)))
+            for line in plan_lines(answer):
+                LOG.info(line)
+            return
         from pipeline.runner import run_campaign
 
         done = run_campaign(campaign, out, until=until, start=start, workers=workers)
@@ -123,7 +161,9 @@ def check(campaign: CampaignPath, quiet: Quiet = False, as_json: Json = False) -
 def survey(
     campaign: CampaignPath,
     body: Annotated[str | None, typer.Option("--body", help="Name of the body; default all with a survey.")] = None,
-    out: Annotated[Path | None, typer.Option("--out", help="Run folder; default runs/<campaign name>.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Run folder; default runs/<campaign name> beside the campaign.")
+    ] = None,
     workers: Workers = None,
     quiet: Quiet = False,
     as_json: Json = False,
@@ -217,7 +257,7 @@ def compensate(
             LOG.warning(sentence)
         remaining = answer["remaining_max_mm"]
         size = f"at most {remaining:.2g} mm" if remaining >= 1e-4 else "below 0.0001 mm"
-        LOG.info(f"{answer['frames']} rows in {out}, remaining error {size}")
+        LOG.info(f"{answer['frames']} rows in {out}; residual of the model's inversion {size}, not the robot's error")
 
 
 @app.command()
@@ -335,8 +375,11 @@ def export(
 
 def main() -> None:
     """Entry point of the console script."""
+    keep_libraries_silent()
     try:
         app()
+    except KeyboardInterrupt:
+        sys.exit(INTERRUPTED)
     except BrokenPipeError:  # the reader of our output went away, as in `pipeline ... | head`
         sys.stderr.close()
         sys.exit(1)

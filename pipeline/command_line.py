@@ -11,7 +11,7 @@ from typing import Annotated, Any, NoReturn
 import typer
 
 from pipeline.json_io import plain
-from pipeline.messages import show
+from pipeline.messages import LOG, Heard, show
 from robcal.errors import RobcalError
 
 Quiet = Annotated[bool, typer.Option("-q", "--quiet", help="Only warnings and errors on standard error.")]
@@ -23,16 +23,28 @@ InstrumentName = Annotated[
 ]
 CampaignPath = Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="Campaign folder, or its YAML file.")]
 
+INTERRUPTED = 130
+"""Exit code after Ctrl-C, as shells expect it."""
+
 
 @contextmanager
 def answers(command: str, as_json: bool, quiet: bool) -> Iterator[dict[str, Any]]:
     """Run a command's body; errors on purpose become one line and exit code 1, a mistake of the program too."""
     answer: dict[str, Any] = {}
     show(quiet)
+    heard = Heard()
+    LOG.addHandler(heard)
     try:
         yield answer
     except typer.Exit:
         raise
+    except KeyboardInterrupt:
+        _fail(
+            command,
+            as_json,
+            "interrupted: the same command goes on where it was, finished stages are kept",
+            INTERRUPTED,
+        )
     except RobcalError as error:
         _fail(command, as_json, " ".join(str(error).split()))
     except OSError as error:
@@ -46,15 +58,18 @@ def answers(command: str, as_json: bool, quiet: bool) -> Iterator[dict[str, Any]
         ) as stream:
             stream.write(traceback.format_exc())
         _fail(command, as_json, f"internal error ({type(error).__name__}): the traceback is in {stream.name}")
+    finally:
+        LOG.removeHandler(heard)
     if as_json:
+        answer.setdefault("warnings", heard.sentences)
         typer.echo(json.dumps(plain({"ok": True, "command": command, **answer})))
 
 
-def _fail(command: str, as_json: bool, sentence: str) -> None:
+def _fail(command: str, as_json: bool, sentence: str, code: int = 1) -> None:
     typer.echo(f"error: {sentence}", err=True)
     if as_json:
         typer.echo(json.dumps({"ok": False, "command": command, "error": sentence}))
-    raise typer.Exit(1)
+    raise typer.Exit(code)
 
 
 def wrong_use(sentence: str) -> NoReturn:

@@ -1,18 +1,19 @@
 """Commands exchange and transfer: a new robot in place of a calibrated one."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from pipeline.campaign import Campaign
-from pipeline.mastering import keep_calibrated, measured_campaign, recording_for
+from pipeline.mastering import keep_calibrated, marks_in_known_cameras, measured_campaign, recording_for
 from pipeline.runs import Run, open_run
 from pipeline.stages.identify import load_calibrated, require_robot
 from robcal.calibration.calibrated import CalibratedRobot
 from robcal.calibration.identifiability import repetitions
 from robcal.calibration.joint_log import JointLog
-from robcal.calibration.measurements import RobotRecording
+from robcal.calibration.observations import Observations
 from robcal.cell.exchange import FEW, exchange, exchange_by_mastering, transfer
 from robcal.errors import InvalidInput, NotIdentifiable, located
 from robcal.files.poses_table import joint_columns, read_poses
@@ -38,7 +39,9 @@ def exchange_robot(reference: Path, campaign_path: Path, out: Path, workers: int
             "both with the same, or with cameras of the same name that have not been moved"
         )
     if int(repetitions(log.q, 1e-3).max(initial=-1)) + 1 < FEW:
-        return _from_few(robot, nominal, log, recording, campaign, run, out)
+        marks = marks_in_known_cameras(before, run, campaign, log)
+        observations = recording.observations if marks is None else (marks,)
+        return _from_few(robot, nominal, log, observations, recording.stated, campaign, run, out)
     try:
         found = exchange(robot, nominal, log, recording)
     except (InvalidInput, NotIdentifiable) as error:
@@ -65,14 +68,15 @@ def _from_few(
     robot: CalibratedRobot,
     nominal: RobotModel,
     log: JointLog,
-    recording: RobotRecording,
+    observations: Sequence[Observations],
+    stated: bool,
     campaign: Campaign,
     run: Run,
     out: Path,
 ) -> dict[str, Any]:
     """A run of the new robot from one to three poses: zero offsets alone."""
     try:
-        found = exchange_by_mastering(robot, nominal, log, recording)
+        found = exchange_by_mastering(robot, nominal, log, observations, stated)
     except (InvalidInput, NotIdentifiable) as error:
         raise located(error, str(campaign.path)) from None
     keep_calibrated(run, found.robot, f"exchanged for {robot.model.name}, from campaign {campaign.name}")

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.artifacts import CALIBRATED, ORIENTATION
+from pipeline.artifacts import CALIBRATED, MARKS, ORIENTATION
 from pipeline.bodies import body_for_robot
 from pipeline.campaign import Campaign, read_campaign
 from pipeline.json_io import write_json
@@ -17,7 +17,7 @@ from pipeline.stages.observations import build_recording
 from robcal.calibration.calibrated import CalibratedRobot
 from robcal.calibration.joint_log import JointLog
 from robcal.calibration.measurements import RobotRecording, Rows
-from robcal.calibration.observations import FrameObservations
+from robcal.calibration.observations import FrameObservations, PixelObservations
 from robcal.cell.mastering import Mastering, master
 from robcal.cell.notch import notch_extremum
 from robcal.errors import DegenerateGeometry, InvalidInput, NotIdentifiable, located
@@ -44,8 +44,10 @@ def master_campaign(
     robot = load_calibrated(before)
     campaign, run = measured_campaign(campaign_path, out, workers)
     log, recording, free = recording_for(robot, before, campaign, run)
+    marks = marks_in_known_cameras(before, run, campaign, log)
+    observations = recording.observations if marks is None else (marks,)
     try:
-        found = master(robot, log, recording.observations, joints=joints, free=free, stated=recording.stated)
+        found = master(robot, log, observations, joints=joints, free=free, stated=recording.stated)
     except (InvalidInput, NotIdentifiable) as error:
         raise located(error, str(campaign.path)) from None
     data = mastering_data(found, robot.model)
@@ -88,6 +90,34 @@ def recording_for(
         raise InvalidInput(f"{campaign.path}: no measured pose is left: set 'identify' in the column set")
     moved = RobotRecording(observations, observations, recording.stated, recording.notes)
     return _rows(poses, rows), RobotRecording(moved.select(rows), moved.select(rows), recording.stated), free
+
+
+def marks_in_known_cameras(before: Run, run: Run, campaign: Campaign, log: JointLog) -> PixelObservations | None:
+    """Marks of a station's cameras that the calibration knows already, as they are in the images.
+
+    A few poses do not orient a camera anew, let alone calibrate it: its interior and exterior orientation are those of
+    the calibration. None where no camera of that name was there. Weakness: their uncertainty is not carried.
+    """
+    station, marks = before.find(ORIENTATION), run.find(MARKS)
+    if station is None or marks is None or campaign.poses is None:
+        return None
+    known = [name for name in station.names if name in marks and len(marks[name])]
+    row = {name: k for k, name in enumerate(log.names)}
+    of_pose = np.array([row.get(name, -1) for name in campaign.poses.names], dtype=np.int64)
+    parts = []
+    for k, name in enumerate(known):
+        own = marks[name]
+        at, pose = station.body.index(own.target), of_pose[own.pose]
+        good = np.flatnonzero((at >= 0) & (pose >= 0))
+        good = good[station.body.known[at[good]]]
+        camera = np.full(len(good), k, dtype=np.int64)
+        parts.append((pose[good], camera, station.body.points[at[good]], own.xy[good], own.covariance[good]))
+    if not parts or not sum(len(p[0]) for p in parts):
+        return None
+    pose, camera, points, xy, covariance = (np.concatenate([p[j] for p in parts]) for j in range(5))
+    cameras = tuple(station.cameras[station.names.index(name)] for name in known)
+    placed = np.array([np.linalg.inv(station.world_T_camera[name]) for name in known])
+    return PixelObservations(pose, camera, points, xy, covariance, cameras, placed)
 
 
 def _to_world_of(known: dict[str, Array], own: dict[str, Array]) -> Array | None:

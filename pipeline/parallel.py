@@ -5,6 +5,7 @@ Workers are spawned, not forked: a forked one would inherit the lock of the run 
 
 import multiprocessing
 import os
+import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -22,6 +23,7 @@ THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"
 
 def begin_worker(parent: int) -> None:
     """One thread each, and no life after the parent's: a run killed with -9 leaves no worker behind."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends its workers
     import cv2
 
     cv2.setNumThreads(1)
@@ -56,6 +58,10 @@ def in_processes(work: Callable[[A], B], items: Sequence[A], workers: int) -> It
             except BrokenProcessPool:
                 remedy = "probably for lack of memory: run again with --workers 1"
                 raise InvalidInput(f"a worker process died, {remedy}") from None
+            except KeyboardInterrupt:
+                for child in multiprocessing.active_children():
+                    child.terminate()  # at once, not after the image that it is at
+                raise
             finally:
                 pool.shutdown(cancel_futures=True)
     finally:

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -12,11 +12,12 @@ from robcal.errors import InvalidInput
 from robcal.files.cell_files import read_placed
 from robcal.files.schemas import proposal
 from robcal.files.storage import read_bytes, write_atomic
+from robcal.files.yaml_io import read_yaml
 from robcal.programs.correction import Corrected, GivenFrames, correct
 from robcal.programs.dialects import dialect_of, read_program
 from robcal.programs.text import Source
 from robcal.robot.kernel_cache import kernel_of
-from robcal.transforms import Array
+from robcal.transforms import Array, frame_from_xyzrpy
 
 MAX_BYTES = 50_000_000
 
@@ -105,6 +106,23 @@ def _beside(out: Path, data: Path) -> Path:
     return out.with_suffix(data.suffix)
 
 
+def _placed(path: Path, key: Literal["flange_T_tool", "base_T_object"]) -> Array:
+    """The frame in a result of the cell, or in a YAML file that holds nothing but it."""
+    document = read_yaml(path)
+    alone = document.data.get(key)
+    if "format" in document.data or not isinstance(alone, dict):
+        return read_placed(path, key).T
+    six = []
+    for name, scale in (("xyz_mm", 1e-3), ("rpy_deg", np.pi / 180)):
+        values = alone.get(name, [0.0, 0.0, 0.0])
+        numbers = isinstance(values, list) and all(isinstance(v, int | float) and np.isfinite(v) for v in values)
+        if not numbers or len(values) != 3:
+            line = document.line((key, name))
+            raise InvalidInput(f"{path}, line {line}: {key}.{name} must be three numbers")
+        six += [scale * float(v) for v in values]
+    return frame_from_xyzrpy(six)
+
+
 def _frames(options: Sequence[str], what: str) -> dict[str, Array]:
     """Frames of `NAME=FILE` options by name."""
     found: dict[str, Array] = {}
@@ -114,6 +132,5 @@ def _frames(options: Sequence[str], what: str) -> dict[str, Array]:
             raise InvalidInput(f"--{what} is NAME=FILE (a result of 'pipeline cell'), not '{option}'")
         if name.strip() in found:
             raise InvalidInput(f"--{what} {name.strip()} is given twice: give one file")
-        placed = read_placed(Path(path), "flange_T_tool" if what == "tool" else "base_T_object")
-        found[name.strip()] = placed.T
+        found[name.strip()] = _placed(Path(path), "flange_T_tool" if what == "tool" else "base_T_object")
     return found

@@ -10,7 +10,7 @@ from typing import Any
 from pipeline.campaign import Campaign, all_sources, read_campaign
 from pipeline.codec import StaleCache
 from pipeline.json_io import fingerprint, read_json, write_json
-from pipeline.messages import LOG, logged_to
+from pipeline.messages import LOG, logged_to, working
 from pipeline.runs import RUN_FORMAT, Run, StageRecord, run_file
 from pipeline.sources import code_version
 from pipeline.stages.base import Context, Outcome, Stage
@@ -38,8 +38,15 @@ class Done:
 
 
 def default_folder(campaign: Campaign) -> Path:
-    """``runs/<campaign name>`` in the current folder."""
-    return Path("runs") / campaign.name
+    """``runs/<campaign name>`` beside the campaign; in the current folder where a run of it is, or nothing else can be.
+
+    A campaign in the current folder itself has its runs there as well.
+    """
+    here = Path("runs") / campaign.name
+    beside = campaign.path.absolute().parent.parent
+    if run_file(Run(here)).is_file() or beside == Path.cwd() or not os.access(beside, os.W_OK):
+        return here
+    return beside / here
 
 
 def processes() -> int:
@@ -77,7 +84,7 @@ def run_campaign(
         raise InvalidInput(f"stage '{until}' comes before '{start}': --until must not lie before --from")
     campaign = read_campaign(path)
     run = Run(out or default_folder(campaign))
-    _keep_inputs_apart(campaign, run)
+    keep_inputs_apart(campaign, run)
     with run.lock(), logged_to(run.log):
         LOG.debug("run of %s in %s", campaign.path, run.folder)
         check_joint_limits(campaign, run)
@@ -96,7 +103,13 @@ def run_campaign(
             run.save_hashes()
 
 
-def _keep_inputs_apart(campaign: Campaign, run: Run) -> None:
+def keep_inputs_apart(campaign: Campaign, run: Run) -> None:
+    """Refuse a run folder that holds recordings, or files that are none of a run.
+
+    Raises
+    ------
+    InvalidInput : it does.
+    """
     out = run.folder.resolve()
     if out == campaign.path.parent.resolve():
         raise InvalidInput(f"{run.folder}: is the campaign itself, which is never written to: choose another --out")
@@ -172,7 +185,9 @@ def _run_stage(stage: Stage, key: str, context: Context) -> None:
     LOG.info("%s: ...", stage.name)
     begin = time.perf_counter()
     try:
-        outcome = stage.work(context)
+        before = context.run.record(stage.name)
+        with working(stage.name, before.seconds if before is not None else None):
+            outcome = stage.work(context)
     except StaleCache as error:
         raise InvalidInput(f"{error}") from None
     except RobcalError as error:

@@ -109,7 +109,12 @@ def _robot(material: Material, v: Verification) -> Verdict:
     )
 
 
-_SOURCES = {"stated": "as stated", "repeats": "from repeated poses", "lengths": "from lengths on the body"}
+_SOURCES = {
+    "stated": "as stated",
+    "repeats": "from repeated poses",
+    "lengths": "from lengths on the body",
+    "residuals": "from what is left",
+}
 
 
 def _measurement(noise: Mapping[str, Any]) -> str:

@@ -1,5 +1,6 @@
 """Stage hand_eye: where a camera sits in the hand of the robot, or beside it, from images of a board."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -27,8 +28,10 @@ from robcal.handeye.calibration import Options, calibrate
 from robcal.handeye.data import HandEyeData, RobotParameters
 from robcal.handeye.result import HandEye
 from robcal.handeye.robot import calibrated_robot
+from robcal.imaging.detections import Detections
 from robcal.photogrammetry.core.bodies import Body
 from robcal.photogrammetry.core.camera import Camera
+from robcal.photogrammetry.identify.targets import coded_rows
 from robcal.photogrammetry.station.identify import identify_station
 from robcal.photogrammetry.station.network import StationMarks
 from robcal.physics.hand_eye import moved_content
@@ -115,6 +118,8 @@ def _marks(
         return StationMarks(pose, table.target, table.xy, table.sigma[:, None, None] ** 2 * np.eye(2)), []
     name = entry.camera.name
     found = load_detections(run, run.load(DETECTED), f"hand_eye/{name}")
+    if campaign.bodies[entry.board].file.board is not None:
+        return _on_board({place[image]: each for image, each in found.items()}, body, campaign), []
     start = source.images.start.camera if source.images.start else None
     identified = identify_station({name: {place[image]: each for image, each in found.items()}}, body, {name: start})
     marks = identified.marks.get(name)
@@ -122,6 +127,18 @@ def _marks(
         why = next((reason for _, _, reason in identified.problems), "no targets found")
         raise InvalidInput(f"{campaign.path}: hand_eye: board '{body.name}' is in no image of '{name}': {why}")
     return marks, [f"pose '{poses.names[p]}': board not identified: {why}" for _, p, why in identified.problems]
+
+
+def _on_board(found: Mapping[int, Detections], body: Body, campaign: Campaign) -> StationMarks:
+    """Marks of a printed board, whose detector numbers them: pose, id, place and covariance."""
+    parts = []
+    for pose, each in sorted(found.items()):
+        rows, ids = coded_rows(each, body)
+        parts.append((np.full(len(rows), pose, dtype=np.int64), ids, each.xy[rows], each.covariance[rows]))
+    if not sum(len(part[0]) for part in parts):
+        raise InvalidInput(f"{campaign.path}: hand_eye: board '{body.name}' is in no image: is its file right?")
+    numbers, target, xy, covariance = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return StationMarks(numbers, target, xy, covariance)
 
 
 def _robot(campaign: Campaign, run: Run, poses: Poses) -> RobotParameters | None:

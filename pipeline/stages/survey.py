@@ -156,7 +156,8 @@ def _not_on_it(campaign: Campaign, run: Run, name: str, source: BodySource) -> f
 
 
 def _write(run: Run, name: str, source: BodySource, body: Body, done: SurveyResult) -> list[Any]:
-    write_body(run.body(name), body, f"surveyed: {done.frame}; {done.scale}", source.file.board)
+    comment = f"surveyed: {done.frame}; {done.scale}"
+    write_body(run.body(name), body, comment, source.file.board, source.file.ring)
     sigma = np.sqrt(np.clip(np.diag(done.network.intrinsics_covariance), 0, None))
     start = source.survey.start if source.survey is not None else None
     pixel = start.pixel_um if start is not None else None

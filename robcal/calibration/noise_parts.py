@@ -22,11 +22,13 @@ from robcal.calibration.observations import (
 )
 from robcal.transforms import Array
 
-Source = Literal["stated", "repeats", "lengths", "none"]
+Source = Literal["stated", "repeats", "lengths", "residuals", "none"]
 
 LEVEL = 0.01
 DISAGREE = 3.0
 """Factor between two figures of the measurement noise from which their disagreement is told."""
+LARGE = 0.7
+"""Share of a stated sigma below which residuals refute it: the model can only add to the noise."""
 WRONG = 10.0
 """Factor from which a stated sigma is not believed."""
 CLIP = 4.0
@@ -75,6 +77,7 @@ def noise_parts(
     stated: bool,
     lever: float,
     weighted: float = 1.0,
+    left: float = 1.0,
 ) -> NoiseParts:
     """Split what is left of a robot.
 
@@ -85,6 +88,7 @@ def noise_parts(
     parameters : number of fitted parameters. stated : whether the measurements state their uncertainty.
     lever : RMS way (m) of the measured place by one radian of scatter in every joint.
     weighted : factor on the stated sigmas that the observations have, which are not believed unless it is one.
+    left : factor on the stated variances that everything known of the recording leaves: noise is no larger.
     """
     pose = np.concatenate([o.pose for o in observations])
     group = np.concatenate([_targets(o) for o in observations])
@@ -94,14 +98,17 @@ def noise_parts(
     lengths = length_scatter(observations)
     told = float(np.sqrt(stated_square(observations))) / weighted if stated else None
     measurement, source, notes = _measurement(told, pure, lengths, refuted=weighted != 1.0)
+    if source == "stated" and left < LARGE**2:
+        measurement, source = measurement * float(np.sqrt(left)), "residuals"
+        notes.append("the stated uncertainty is larger than what is left with all that was found: that figure counts")
     dimension = residuals.shape[1]
     freedom = max(1, len(residuals) * dimension - parameters)
-    left = _Scatter(float(np.sum(residuals**2)) / freedom * dimension, freedom)
+    total = _Scatter(float(np.sum(residuals**2)) / freedom * dimension, freedom)
     if pure is None:
-        lack = float(np.sqrt(max(0.0, left.square - measurement**2)))
+        lack = float(np.sqrt(max(0.0, total.square - measurement**2)))
         return NoiseParts(measurement, source, told, None, lack, repeats, None, tuple(notes))
-    square = left.square * left.freedom - pure.square * pure.freedom
-    beyond = _Scatter(max(0.0, square) / max(1, left.freedom - pure.freedom), max(1, left.freedom - pure.freedom))
+    square = total.square * total.freedom - pure.square * pure.freedom
+    beyond = _Scatter(max(0.0, square) / max(1, total.freedom - pure.freedom), max(1, total.freedom - pure.freedom))
     p = float(stats.f.sf(beyond.square / max(pure.square, 1e-300), beyond.freedom, pure.freedom))
     lack = float(np.sqrt(max(0.0, beyond.square - pure.square))) if p < LEVEL else 0.0
     scatter = float(np.sqrt(max(0.0, pure.square - measurement**2)) / lever) if lever > 0 else None

@@ -11,7 +11,7 @@ from scipy import stats
 
 from robcal.calibration.identification import IdentifiedRobot, IdentifyOptions, identify
 from robcal.calibration.measurements import RobotObservations, RobotRecording, Rows, rescaled
-from robcal.calibration.noise_parts import length_scatter, stated_square
+from robcal.calibration.noise_parts import LARGE, length_scatter, stated_square
 from robcal.calibration.observations import FrameObservations, PointObservations
 from robcal.robot.kernel import Kernel, PoseInputs
 from robcal.robot.model import RobotModel
@@ -19,8 +19,6 @@ from robcal.transforms import Array
 
 WRONG = 3.0
 """Factor from which lengths on the body refute a stated sigma that is too small."""
-LARGE = 0.7
-"""Share of a stated sigma below which residuals refute it, beyond chance: the model can only add to the noise."""
 LEVEL = 1e-4
 APART = 10.0
 """Factor from which residuals of positions and rotations refute what is stated of them."""

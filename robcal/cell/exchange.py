@@ -6,7 +6,7 @@ them. So the data say what they can, and the predicted uncertainty holds what th
 transferred by the inverse of the new robot at the frames of the reference.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -15,6 +15,7 @@ from robcal.calibration.calibrated import CalibratedRobot
 from robcal.calibration.identification import IdentifiedRobot, IdentifyOptions
 from robcal.calibration.joint_log import JointLog
 from robcal.calibration.measurements import RobotRecording
+from robcal.calibration.observations import Observations
 from robcal.calibration.variance_components import identify_recording
 from robcal.cell.mastering import Mastering, master
 from robcal.errors import InvalidInput
@@ -81,7 +82,11 @@ def exchange(
 
 
 def exchange_by_mastering(
-    reference: CalibratedRobot, nominal: RobotModel, log: JointLog, recording: RobotRecording
+    reference: CalibratedRobot,
+    nominal: RobotModel,
+    log: JointLog,
+    observations: Sequence[Observations],
+    stated: bool = True,
 ) -> Mastering:
     """A new robot of the reference's type from too few poses for its base and tool: one is enough.
 
@@ -105,7 +110,7 @@ def exchange_by_mastering(
         statics=reference.statics,
         nominal=nominal,
     )
-    return master(believed, log, recording.observations, stated=recording.stated)
+    return master(believed, log, observations, stated=stated)
 
 
 def _start(reference: CalibratedRobot, nominal: RobotModel) -> RobotModel:

@@ -11,7 +11,15 @@ from robcal.errors import InvalidInput
 from robcal.files.schemas import Entry, NotNegative, Positive, Text, Triple, Whole, read_entry
 from robcal.files.storage import write_text
 from robcal.files.yaml_io import FlowMapping, YamlDocument, yaml_text
-from robcal.imaging.ring_code import canonical_id, is_id
+from robcal.imaging.ring_code import (
+    FEWEST_SEGMENTS,
+    MOST_SEGMENTS,
+    RING12,
+    RingPattern,
+    canonical_id,
+    is_id,
+    ring_segments,
+)
 from robcal.photogrammetry.boards.layout import Board, BoardKind
 from robcal.photogrammetry.core.bodies import Body
 
@@ -51,12 +59,21 @@ class BoardEntry(Entry):
     diameter_mm: Positive | None = None
 
 
+class RingEntry(Entry):
+    """How ring codes are printed: radii by that of the dot, direction as seen from the front."""
+
+    inner: Positive = 2.0
+    outer: Positive = 3.0
+    direction: Literal["clockwise", "counterclockwise"] = "clockwise"
+
+
 class BodyEntry(Entry):
     """The whole file."""
 
     format: Literal["robcal/body-1"]
     targets: list[TargetEntry] | None = None
     board: BoardEntry | None = None
+    ring: RingEntry | None = None
     shape: ShapeEntry | None = None
     polarity: Literal["bright", "dark"] | None = None
 
@@ -78,7 +95,8 @@ class BodyTargetRow:
 class BodyFile:
     """Content of a body file.
 
-    ``board`` where it is a printed one, whose targets are those of its layout; ``radius`` (m) of a sphere.
+    ``board`` where it is a printed one, whose targets are those of its layout; ``radius`` (m) of a sphere; ``ring``:
+    how ring codes are printed.
     """
 
     path: Path
@@ -86,6 +104,7 @@ class BodyFile:
     polarity: str
     board: Board | None = None
     radius: float | None = None
+    ring: RingPattern = RING12
 
     def known(self) -> tuple[BodyTargetRow, ...]:
         """Targets with id and coordinates."""
@@ -109,7 +128,22 @@ def read_body(path: Path | str) -> BodyFile:
     if not rows:
         raise InvalidInput(f"{document.path}: lists no targets: a body needs at least three, or a 'board'")
     radius = None if entry.shape is None else entry.shape.radius_mm / 1000
-    return BodyFile(document.path, tuple(rows), entry.polarity or "bright", radius=radius)
+    ring = _ring(entry, document)
+    return BodyFile(document.path, tuple(rows), entry.polarity or "bright", radius=radius, ring=ring)
+
+
+def _ring(entry: BodyEntry, document: YamlDocument) -> RingPattern:
+    """The pattern of a body's ring codes, of one number of segments."""
+    kinds = sorted({n for t in entry.targets or () if (n := ring_segments(t.code)) is not None})
+    if len(kinds) > 1:
+        told = ", ".join(f"ring{n}" for n in kinds)
+        raise InvalidInput(f"{document.path}: ring codes of several kinds on one body ({told}): use one")
+    use = entry.ring or RingEntry()
+    try:
+        segments = kinds[0] if kinds else RING12.segments
+        return RingPattern(segments, use.inner, use.outer, use.direction == "clockwise")
+    except InvalidInput as error:
+        raise InvalidInput(f"{document.path}, line {document.line(('ring',))}: {error}") from None
 
 
 def board_of(use: BoardEntry, where: str) -> Board:
@@ -158,12 +192,16 @@ def _faults(entry: BodyEntry, document: YamlDocument) -> Iterator[str]:
                     f"{where}: target {target.id} stands twice (first in line {lines[first[target.id]]}): remove one "
                     "or give it its own id"
                 )
-        if target.code is not None and target.code not in CODES and not target.code.startswith("aruco:"):
+        segments = ring_segments(target.code)
+        ringed = segments is not None and FEWEST_SEGMENTS <= segments <= MOST_SEGMENTS
+        known = target.code is None or target.code in CODES or target.code.startswith("aruco:")
+        if not known and not ringed:
             yield (
-                f"{where}: unknown code '{target.code}': use ring12, aruco:<dictionary>, corner, circle or null (none)"
+                f"{where}: unknown code '{target.code}': use ring12 (or ring{FEWEST_SEGMENTS} to "
+                f"ring{MOST_SEGMENTS}), aruco:<dictionary>, corner, circle or null (none)"
             )
-        if target.code == "ring12" and target.id is None:
-            yield f"{where}: a ring12 target needs its id (the number that its ring shows)"
+        if ringed and target.id is None:
+            yield f"{where}: a {target.code} target needs its id (the number that its ring shows)"
         if target.xyz_mm is not None:
             if places.setdefault(target.xyz_mm, i) != i:
                 yield (
@@ -211,24 +249,27 @@ def check_ring_codes(body: BodyFile) -> None:
     faults = []
     for target in body.targets:
         code = target.id
-        if target.code != "ring12" or code is None:
+        segments = ring_segments(target.code)
+        if segments is None or code is None:
             continue
-        if not 0 <= code < 4096:
-            faults.append(f"{body.path}: {code} is no ring12 id: twelve segments give 0 to 4095")
-        elif not is_id(code):
+        if not 0 <= code < 1 << segments:
+            faults.append(f"{body.path}: {code} is no {target.code} id: its segments give 0 to {(1 << segments) - 1}")
+        elif not is_id(code, segments):
             faults.append(
-                f"{body.path}: {code} is no ring12 id: the id is the smallest of its cyclic readings, here "
-                f"{canonical_id(code)}"
+                f"{body.path}: {code} is no {target.code} id: the id is the smallest of its cyclic readings, here "
+                f"{canonical_id(code, segments)}"
             )
     if faults:
         raise InvalidInput(faults[0], faults)
 
 
-def write_body(path: Path | str, body: Body, comment: str = "", board: Board | None = None) -> None:
+def write_body(
+    path: Path | str, body: Body, comment: str = "", board: Board | None = None, ring: RingPattern = RING12
+) -> None:
     """Write a body with its coordinates atomically.
 
     ``sigma_mm`` is written for x, y and z apart; the full covariance has its place in the stage's cache. Coordinates of
-    a ``board`` stand beside its layout.
+    a ``board`` stand beside its layout; ``ring``: how its ring codes are printed.
     """
     sigma = None
     if body.covariance is not None:
@@ -248,6 +289,9 @@ def write_body(path: Path | str, body: Body, comment: str = "", board: Board | N
         data["board"] = board_entry(board)
     if body.polarity != ("bright" if board is None else "dark"):
         data["polarity"] = body.polarity
+    if (ring.inner, ring.outer, ring.clockwise) != (RING12.inner, RING12.outer, RING12.clockwise):
+        direction = "clockwise" if ring.clockwise else "counterclockwise"
+        data["ring"] = FlowMapping(inner=ring.inner, outer=ring.outer, direction=direction)
     data["targets"] = targets
     write_text(Path(path), yaml_text(data, comment))
 

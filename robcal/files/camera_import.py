@@ -22,6 +22,7 @@ from robcal.photogrammetry.core.lenses import FisheyeCamera, RationalCamera
 from robcal.transforms import Array
 
 _MAX_BYTES = 1_000_000
+_MOST_PIXELS = 100_000
 _WIDTH = ("imagewidth", "width")
 _HEIGHT = ("imageheight", "height")
 _SIZE = ("imagesize", "resolution", "size")
@@ -108,7 +109,10 @@ def _from_entries(path: Path, data: Mapping[str, Any]) -> Camera:
     else:
         raise InvalidInput(f"{path}: no camera matrix (3 x 3, or the four numbers fx, fy, cx, cy)")
     model = _plain(str(first(("distortionmodel", "cameramodel")) or ""))
-    width, height = int(size[0]), int(size[1])
+    sides = _numbers(path, list(size), "the image size")
+    if sides.size != 2 or not np.all((sides >= 1) & (sides <= _MOST_PIXELS)):
+        raise InvalidInput(f"{path}: the image size must be two whole numbers of pixels up to {_MOST_PIXELS}")
+    width, height = int(sides[0]), int(sides[1])
     start = (width, height, 1.0, 1.0, 0.0, 0.0)
     if model in _FISHEYE or entries.get("fisheyemodel"):
         if D.size not in (0, 4):
@@ -183,6 +187,10 @@ def _metashape(path: Path, text: str) -> Camera:
         raise InvalidInput(f"{path}: width, height or f is missing: export the calibration as Metashape's own XML")
     if extra := [name for name in ("k4", "b2") if values[name] != 0.0]:
         raise InvalidInput(f"{path}: {', '.join(extra)} has no counterpart here: adjust without it")
+    if not all(np.isfinite(v) for v in values.values()) or min(values["width"], values["height"]) < 1:
+        raise InvalidInput(f"{path}: width, height and all coefficients must be finite, the size at least one pixel")
+    if max(values["width"], values["height"]) > _MOST_PIXELS:
+        raise InvalidInput(f"{path}: an image side of more than {_MOST_PIXELS} pixels: check width and height")
     width, height = int(values["width"]), int(values["height"])
     fy = values["f"]
     fx = fy + values["b1"]

@@ -30,16 +30,21 @@ STILL, SHORTEST = math.radians(0.002), 0.5
 DENSE = 0.25
 """Rows closer in time (s) than this are a recording of motion, not one row for each pose."""
 
-_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+# possessive (++, *+) and anchored at the beginning of a word, so that no text takes longer than its length
+_NUMBER = r"[-+]?+(?:\d++\.?+\d*+|\.\d++)(?:[eE][-+]?+\d++)?+"
 _KUKA = re.compile(
-    r"(?:(?P<name>[$\w]+)\s*(?:\[\s*\d*\s*\])?\s*=\s*)?\{\s*(?:E6AXIS\s*:|AXIS\s*:)?\s*(?P<axes>A1\s+[^{}]*)\}",
+    r"(?:(?<![\w$])(?P<name>[$\w]++)\s*+(?:\[\s*+\d*+\s*+\])?+\s*+=\s*+)?+"
+    r"\{\s*+(?:E6AXIS\s*+:|AXIS\s*+:)?+\s*+(?P<axes>A1\s++[^{}]*+)\}",
     re.IGNORECASE,
 )
-_KUKA_AXIS = re.compile(rf"\b([AE])([1-6])\s+({_NUMBER})", re.IGNORECASE)
-_LIST = rf"\[\s*({_NUMBER}(?:\s*,\s*{_NUMBER})*)\s*\]"
-_ABB = re.compile(rf"(?:jointtarget\s+(?P<name>\w+)\s*:=|MoveAbsJ\s*)\s*\[\s*{_LIST}\s*,\s*{_LIST}\s*\]", re.IGNORECASE)
+_KUKA_AXIS = re.compile(rf"\b([AE])([1-6])\s++({_NUMBER})", re.IGNORECASE)
+_LIST = rf"\[\s*+({_NUMBER}(?:\s*+,\s*+{_NUMBER})*+)\s*+\]"
+_ABB = re.compile(
+    rf"(?:jointtarget\s++(?P<name>\w++)\s*+:=|MoveAbsJ)\s*+\[\s*+{_LIST}\s*+,\s*+{_LIST}\s*+\]", re.IGNORECASE
+)
 _UR = re.compile(
-    rf"(?:(?P<name>\w+?)(?:_q)?\s*=\s*|movej\s*\(\s*|^\s*(?P<label>[\w.]*)[\s:=,]*){_LIST}", re.IGNORECASE | re.M
+    rf"(?:(?<!\w)(?P<name>\w++)\s*+=\s*+|movej\s*+\(\s*+|^[ \t]*+(?P<label>[\w.]*+)[ \t:=,]*+){_LIST}",
+    re.IGNORECASE | re.M,
 )
 
 
@@ -137,7 +142,8 @@ def _ur(text: str) -> list[_Found]:
         values = [math.degrees(float(v)) for v in match.groups()[-1].split(",")]
         before = match[0].split("[")[0]
         if len(values) == 6 and not before.rstrip().endswith("p"):
-            found.append(_Found(line, match["name"] or match["label"] or None, tuple(values)))
+            name = (match["name"] or match["label"] or "").removesuffix("_q")
+            found.append(_Found(line, name or None, tuple(values)))
     return found
 
 

@@ -173,11 +173,21 @@ def _readings(
     n = len(dots)
     if not settings.ring12 or n == 0:
         none = np.zeros(n, bool)
-        return RingReadings(np.full(n, -1, np.int64), none, np.zeros(n), np.zeros((n, 12), bool), np.zeros(n))
+        bits = np.zeros((n, settings.ring.segments), bool)
+        return RingReadings(np.full(n, -1, np.int64), none, np.zeros(n), bits, np.zeros(n), settings.ring)
     sigma = np.sqrt(noise.at(dots.background + 0.5 * dots.contrast))
     sigma = np.where(dots.misfit < _CODED_MISFIT_MAX, sigma, np.inf)  # not clean enough to carry a code
     return read_rings(
-        image, dots.xy, dots.b, dots.s, dots.background, dots.contrast, sigma, saturation, settings.known_codes
+        image,
+        dots.xy,
+        dots.b,
+        dots.s,
+        dots.background,
+        dots.contrast,
+        sigma,
+        saturation,
+        settings.known_codes,
+        settings.ring,
     )
 
 

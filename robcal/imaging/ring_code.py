@@ -1,4 +1,4 @@
-"""Reading of ring12 codes: 12 segments of 30 degrees between two and three radii around a dot.
+"""Reading of ring codes: segments of a ring around a dot (ring12: 12 of 30 degrees between two and three radii).
 
 The dot's ellipse gives the affine map from the target's plane to the image up to a turn; the turn (phase) and the
 segments' brightness are fitted to samples on circles of the target's plane. Blur is part of the model. A reading
@@ -19,12 +19,10 @@ from robcal.imaging.edge_model import tail
 Array = NDArray[np.float64]
 
 SEGMENTS = 12
+FEWEST_SEGMENTS, MOST_SEGMENTS = 8, 20
 _PER_SEGMENT = 8
-_ANGLES = SEGMENTS * _PER_SEGMENT
-_RING = np.array([2.2, 2.4, 2.6, 2.8])  # radii of samples in the ring, in dot radii
-_GAP = np.array([1.4, 1.5, 1.6])
-_SEGMENT_ANGLE = 2.0 * np.pi / SEGMENTS
-_PHI = (np.arange(_ANGLES) + 0.5) * 2.0 * np.pi / _ANGLES
+_IN_RING = np.array([0.2, 0.4, 0.6, 0.8])  # samples by the width of the ring, of the gap
+_IN_GAP = np.array([0.4, 0.5, 0.6])
 _INTERPOLATION_VARIANCE = 0.15  # px^2, blur of bilinear interpolation, mean over the positions within a pixel
 
 _EVIDENCE = 0.35  # of the dot's contrast, somewhere on the ring: below it there is no ring
@@ -35,25 +33,83 @@ _GAP_MAX = 0.22
 _MINOR_AXIS_MIN = 1.4  # px; below it neither gap nor segments are resolved
 _MINOR_BY_BLUR_MIN = 1.5
 _NOISE_MAX = 0.12  # of one pixel, by the contrast
-_BRIGHT_MIN, _BRIGHT_MAX = 3, 10  # bright segments of a code that is not known beforehand
+_BRIGHT_MIN, _DARK_MIN = 3, 2  # bright, dark segments of a code that is not known beforehand
 
 
-def canonical_id(bits: int) -> int:
-    """The smallest of the 12 cyclic readings of 12 bits.
+@dataclass(frozen=True)
+class RingPattern:
+    """How codes are printed.
+
+    Attributes
+    ----------
+    segments : of the ring, 8 to 20 bits. inner, outer : radii of the ring by that of the dot.
+    clockwise : direction in which segments are read, seen from the front.
+    """
+
+    segments: int = SEGMENTS
+    inner: float = 2.0
+    outer: float = 3.0
+    clockwise: bool = True
+
+    def __post_init__(self) -> None:
+        if not FEWEST_SEGMENTS <= self.segments <= MOST_SEGMENTS:
+            raise InvalidInput(
+                f"a ring code of {self.segments} segments: {FEWEST_SEGMENTS} to {MOST_SEGMENTS} can be read"
+            )
+        if not 1.2 <= self.inner < self.outer <= 6.0 or self.outer - self.inner < 0.3:
+            raise InvalidInput(
+                f"a code ring from {self.inner:g} to {self.outer:g} radii of the dot: give 1.2 <= inner < outer <= 6, "
+                "at least 0.3 apart"
+            )
+
+    @property
+    def angles(self) -> Array:
+        """(m,) rad at which rings are sampled."""
+        count = self.segments * _PER_SEGMENT
+        return np.asarray((np.arange(count) + 0.5) * 2.0 * np.pi / count)
+
+    @property
+    def step(self) -> float:
+        """Angle of a segment, rad."""
+        return 2.0 * np.pi / self.segments
+
+    @property
+    def in_ring(self) -> Array:
+        """Radii of samples in the ring, in dot radii."""
+        return np.asarray(self.inner + (self.outer - self.inner) * _IN_RING)
+
+    @property
+    def in_gap(self) -> Array:
+        """Radii of samples between dot and ring."""
+        return np.asarray(1.0 + (self.inner - 1.0) * _IN_GAP)
+
+
+RING12 = RingPattern()
+
+
+def ring_segments(code: str | None) -> int | None:
+    """Segments of a target's code ("ring12": 12), None where it is no ring code."""
+    if code is None or not code.startswith("ring") or not code[4:].isascii() or not code[4:].isdigit():
+        return None
+    return int(code[4:])
+
+
+def canonical_id(bits: int, segments: int = SEGMENTS) -> int:
+    """The smallest of the cyclic readings of so many bits.
 
     Raises
     ------
-    InvalidInput : bits outside 0..4095.
+    InvalidInput : bits that so many segments do not give.
     """
-    if not 0 <= bits < 1 << SEGMENTS:
-        raise InvalidInput(f"a ring12 reading has 12 bits: {bits} is not in 0..4095")
-    mask = (1 << SEGMENTS) - 1
-    return min(((bits << k) | (bits >> (SEGMENTS - k))) & mask for k in range(SEGMENTS))
+    if not 0 <= bits < 1 << segments:
+        raise InvalidInput(f"a ring{segments} reading has {segments} bits: {bits} is not in 0..{(1 << segments) - 1}")
+    mask = (1 << segments) - 1
+    return min(((bits << k) | (bits >> (segments - k))) & mask for k in range(segments))
 
 
-def is_id(number: int) -> bool:
-    """True for the ids of ring12: 151 is one, 302 is not."""
-    return 0 <= number < 1 << SEGMENTS and canonical_id(number) == number
+def is_id(number: int, segments: int = SEGMENTS) -> bool:
+    """True for the ids of a ring code: 151 is one of ring12, 302 is not."""
+    return 0 <= number < 1 << segments and canonical_id(number, segments) == number
 
 
 @dataclass(frozen=True)
@@ -64,7 +120,7 @@ class RingReadings(Columns):
     ----------
     code : (n,) id or -1. evidence : (n,) bool, something bright stands where the ring would be.
     phase : (n,) angle in the target's plane (of the dot's unit circle) where the first segment begins, rad.
-    bits : (n, 12) bool in the order of increasing angle from the phase. level : (n,) the ring's brightness by the
+    bits : (n, segments) bool in the order of increasing angle from the phase. level : (n,) the ring's brightness by the
     dot's contrast.
     """
 
@@ -73,6 +129,7 @@ class RingReadings(Columns):
     phase: Array
     bits: NDArray[np.bool_]
     level: Array
+    pattern: RingPattern = RING12
 
 
 def _matrices(b: Array) -> Array:
@@ -102,9 +159,9 @@ def _profile_widths(b: Array, s: Array, phi: Array) -> tuple[Array, Array]:
     return s[:, None] * radial, s[:, None] * angular
 
 
-def _window(delta: Array, sigma: Array) -> Array:
-    """A segment's brightness at the angle delta from its middle, blurred by sigma (rad)."""
-    half = 0.5 * _SEGMENT_ANGLE
+def _window(delta: Array, sigma: Array, step: float) -> Array:
+    """Brightness of a segment of the angle ``step`` at the angle delta from its middle, blurred by sigma (rad)."""
+    half = 0.5 * step
     return ndtr((delta + half) / sigma) - ndtr((delta - half) / sigma)
 
 
@@ -122,6 +179,7 @@ def read_rings(  # noqa: PLR0913 - columns of many dots
     noise_sigma: Array,
     saturation: float,
     known_codes: frozenset[int] | None = None,
+    pattern: RingPattern = RING12,
 ) -> RingReadings:
     """Reads the codes around n fitted dots.
 
@@ -129,11 +187,12 @@ def read_rings(  # noqa: PLR0913 - columns of many dots
     ----------
     image : (h, w), bright dots. xy : (n, 2). b : (n, 3) ellipse matrix B11, B12, B22 (pixels to unit circle).
     blur : (n,) s of the edge profile, px. background, contrast : (n,) grey values. noise_sigma : (n,) of one pixel.
-    saturation : grey value above which nothing is known. known_codes : only these are codes.
+    saturation : grey value above which nothing is known. known_codes : only these are codes. pattern : of the codes.
     """
     n = len(xy)
+    segments, phi = pattern.segments, pattern.angles
     empty = RingReadings(
-        np.full(n, -1, np.int64), np.zeros(n, bool), np.zeros(n), np.zeros((n, SEGMENTS), bool), np.zeros(n)
+        np.full(n, -1, np.int64), np.zeros(n, bool), np.zeros(n), np.zeros((n, segments), bool), np.zeros(n), pattern
     )
     if n == 0:
         return empty
@@ -141,80 +200,80 @@ def read_rings(  # noqa: PLR0913 - columns of many dots
     contrast = np.minimum(contrast, saturation - background)
     to_image = np.linalg.inv(_matrices(b))
     s = np.sqrt(blur**2 + _INTERPOLATION_VARIANCE)
-    rho = np.concatenate([_GAP, _RING])
-    circle = np.stack([np.cos(_PHI), np.sin(_PHI)], axis=-1)
+    rho = np.concatenate([pattern.in_gap, pattern.in_ring])
+    circle = np.stack([np.cos(phi), np.sin(phi)], axis=-1)
     places = np.einsum("nij,aj->nai", to_image, circle)[:, None] * rho[None, :, None, None] + xy[:, None, None]
     grey, inside = _bilinear(image, places[..., 0], places[..., 1])
     complete = inside.all(axis=(1, 2))
-    radial, angular = _profile_widths(b, s, _PHI)
+    radial, angular = _profile_widths(b, s, phi)
     # in units of the dot's contrast, without the dot's own glare
     y = (grey - background[:, None, None]) / np.maximum(contrast, 1e-6)[:, None, None]
     y -= ndtr(-(rho[None, :, None] - 1.0) / radial[:, None, :])
-    gap, ring = y[:, : len(_GAP)], y[:, len(_GAP) :]
-    in_ring = _RING[None, :, None]
-    factor = ndtr((in_ring - 2.0) / radial[:, None]) - ndtr((in_ring - 3.0) / radial[:, None])
+    gap, ring = y[:, : len(_IN_GAP)], y[:, len(_IN_GAP) :]
+    in_ring = pattern.in_ring[None, :, None]
+    factor = ndtr((in_ring - pattern.inner) / radial[:, None]) - ndtr((in_ring - pattern.outer) / radial[:, None])
     profile = (factor * ring).sum(axis=1) / (factor**2).sum(axis=1)
-    sigma_angle = angular / 2.5
+    sigma_angle = angular * 2.0 / (pattern.inner + pattern.outer)
     evidence = np.sort(profile, axis=1)[:, -3] > _EVIDENCE
     minor = 1.0 / np.linalg.eigvalsh(_matrices(b))[:, 1]
     resolved = (noise_sigma < _NOISE_MAX * contrast) & (minor > _MINOR_AXIS_MIN) & (minor > _MINOR_BY_BLUR_MIN * blur)
     readable = np.flatnonzero(evidence & complete & resolved & (contrast > 0))
     if readable.size == 0:
-        return RingReadings(empty.code, evidence, empty.phase, empty.bits, empty.level)
-    fit = _fit(profile[readable], sigma_angle[readable])
+        return RingReadings(empty.code, evidence, empty.phase, empty.bits, empty.level, pattern)
+    fit = _fit(profile[readable], sigma_angle[readable], pattern)
     noise = noise_sigma[readable] / np.maximum(contrast[readable], 1e-6)
-    sure = _is_certain(fit, ring[readable], gap[readable], factor[readable], sigma_angle[readable], noise)
+    sure = _is_certain(fit, ring[readable], gap[readable], factor[readable], sigma_angle[readable], noise, pattern)
     bits, phase, level = empty.bits.copy(), empty.phase.copy(), empty.level.copy()
     bits[readable], phase[readable], level[readable] = fit.bits, fit.phase, fit.level
     code = empty.code.copy()
     for row, good in zip(readable, sure, strict=True):
-        reading = int("".join("1" if bit else "0" for bit in bits[row]), 2)
-        number = canonical_id(reading)
-        allowed = _allowed(number, known_codes)
+        in_order = bits[row] if pattern.clockwise else bits[row][::-1]
+        number = canonical_id(int("".join("1" if bit else "0" for bit in in_order), 2), segments)
+        allowed = _allowed(number, known_codes, segments)
         if good and allowed:
             code[row] = number
-    return RingReadings(code, evidence, phase, bits, level)
+    return RingReadings(code, evidence, phase, bits, level, pattern)
 
 
-def _allowed(number: int, known_codes: frozenset[int] | None) -> bool:
+def _allowed(number: int, known_codes: frozenset[int] | None, segments: int) -> bool:
     if known_codes is not None:
         return number in known_codes
     # one or two bright segments or a single dark one can be anything: dust beside a dot, a scratch across a ring
-    return _BRIGHT_MIN <= number.bit_count() <= _BRIGHT_MAX
+    return _BRIGHT_MIN <= number.bit_count() <= segments - _DARK_MIN
 
 
 @dataclass(frozen=True)
 class _Fit:
     phase: Array
-    amplitude: Array  # (n, 12)
-    sigma: Array  # (n, 12) for unit noise of the profile
+    amplitude: Array  # (n, segments)
+    sigma: Array  # (n, segments) for unit noise of the profile
     bits: NDArray[np.bool_]
     level: Array
 
 
-def _fit(profile: Array, sigma_angle: Array) -> _Fit:
-    """Phase and segment brightnesses from (n, 96) profiles."""
-    n = len(profile)
-    # coarse phase: the shift by whole samples whose 12 sector means leave least
-    step = 2.0 * np.pi / _ANGLES
+def _fit(profile: Array, sigma_angle: Array, pattern: RingPattern) -> _Fit:
+    """Phase and segment brightnesses from (n, m) profiles at the pattern's angles."""
+    n, segments, phi, width = len(profile), pattern.segments, pattern.angles, pattern.step
+    # coarse phase: the shift by whole samples whose sector means leave least
+    step = 2.0 * np.pi / len(phi)
     best, phase = np.full(n, np.inf), np.zeros(n)
     for shift in range(_PER_SEGMENT):
-        blocks = np.roll(profile, -shift, axis=1).reshape(n, SEGMENTS, _PER_SEGMENT)
+        blocks = np.roll(profile, -shift, axis=1).reshape(n, segments, _PER_SEGMENT)
         spread = ((blocks - blocks.mean(axis=2, keepdims=True)) ** 2).sum(axis=(1, 2))
         better = spread < best
         best[better], phase[better] = spread[better], shift * step
-    amplitude = np.zeros((n, SEGMENTS))
-    inverse = np.zeros((n, SEGMENTS, SEGMENTS))
-    middle = (np.arange(SEGMENTS) + 0.5) * _SEGMENT_ANGLE
-    ridge = 1e-6 * np.eye(SEGMENTS)
+    amplitude = np.zeros((n, segments))
+    inverse = np.zeros((n, segments, segments))
+    middle = (np.arange(segments) + 0.5) * width
+    ridge = 1e-6 * np.eye(segments)
     for _ in range(4):
-        delta = _wrap(_PHI[None, :, None] - phase[:, None, None] - middle[None, None, :])
+        delta = _wrap(phi[None, :, None] - phase[:, None, None] - middle[None, None, :])
         sigma = sigma_angle[:, :, None]
-        templates = _window(delta, sigma)
+        templates = _window(delta, sigma, width)
         inverse = np.linalg.inv(np.matmul(templates.transpose(0, 2, 1), templates) + ridge)
         amplitude = np.einsum("nkl,npl,np->nk", inverse, templates, profile)
         residual = profile - np.einsum("npk,nk->np", templates, amplitude)
-        half = 0.5 * _SEGMENT_ANGLE
+        half = 0.5 * width
         upper, lower = (delta + half) / sigma, (delta - half) / sigma
         density = (np.exp(-0.5 * np.minimum(upper**2, 60.0)) - np.exp(-0.5 * np.minimum(lower**2, 60.0))) / sigma
         slope = -np.einsum("npk,nk->np", density, amplitude) / np.sqrt(2.0 * np.pi)
@@ -226,7 +285,9 @@ def _fit(profile: Array, sigma_angle: Array) -> _Fit:
     return _Fit(phase, amplitude, np.sqrt(np.diagonal(inverse, axis1=1, axis2=2)), bits, level)
 
 
-def _is_certain(fit: _Fit, ring: Array, gap: Array, factor: Array, sigma_angle: Array, noise: Array) -> NDArray:
+def _is_certain(
+    fit: _Fit, ring: Array, gap: Array, factor: Array, sigma_angle: Array, noise: Array, pattern: RingPattern
+) -> NDArray:
     """(n,) True where nothing speaks against the reading."""
     level = fit.level
     good = (level > 0.45) & (level < 1.6)
@@ -236,11 +297,10 @@ def _is_certain(fit: _Fit, ring: Array, gap: Array, factor: Array, sigma_angle: 
     distance = np.abs(fit.amplitude * scale[:, None] - 0.5)
     good &= (distance > np.maximum(_MARGIN, 4.0 * sigma)).all(axis=1)
     # too blurred to be distinguished
-    good &= (factor.max(axis=1) > 0.35).all(axis=1) & (sigma_angle.max(axis=1) < 0.45 * _SEGMENT_ANGLE)
-    middle = (np.arange(SEGMENTS) + 0.5) * _SEGMENT_ANGLE
-    templates = _window(
-        _wrap(_PHI[None, :, None] - fit.phase[:, None, None] - middle[None, None, :]), sigma_angle[:, :, None]
-    )
+    good &= (factor.max(axis=1) > 0.35).all(axis=1) & (sigma_angle.max(axis=1) < 0.45 * pattern.step)
+    middle = (np.arange(pattern.segments) + 0.5) * pattern.step
+    delta = _wrap(pattern.angles[None, :, None] - fit.phase[:, None, None] - middle[None, None, :])
+    templates = _window(delta, sigma_angle[:, :, None], pattern.step)
     predicted = np.einsum("npk,nk->np", templates, fit.bits.astype(float))
     misfit = ring * scale[:, None, None] - factor * predicted[:, None, :]
     # a slow change of brightness around the ring is shading, not a wrong code
@@ -260,15 +320,16 @@ def _is_certain(fit: _Fit, ring: Array, gap: Array, factor: Array, sigma_angle: 
 
 def ring_glare(xy: Array, b: Array, s: Array, reading: RingReadings, row: Array, x: Array, y: Array) -> Array:
     """Predicted brightness of the ring by the dot's contrast, (n, p), at pixels (n, p), for readings `row`."""
-    matrix = _matrices(b)
+    matrix, pattern = _matrices(b), reading.pattern
+    phi, count = pattern.angles, len(pattern.angles)
     # around the ring the brightness depends on the angle alone; its blur is that at the ring's inner edge, from where
     # the glare comes
-    around = np.zeros((len(xy), _ANGLES))
-    tangent = np.stack([-np.sin(_PHI), np.cos(_PHI)], axis=-1)
-    angular = s[:, None] * np.linalg.norm(np.einsum("nij,aj->nai", matrix, tangent), axis=-1) / 2.2
-    for k in range(SEGMENTS):
-        middle = reading.phase[row] + (k + 0.5) * _SEGMENT_ANGLE
-        around += reading.bits[row, k, None] * _window(_wrap(_PHI[None] - middle[:, None]), angular)
+    around = np.zeros((len(xy), count))
+    tangent = np.stack([-np.sin(phi), np.cos(phi)], axis=-1)
+    angular = s[:, None] * np.linalg.norm(np.einsum("nij,aj->nai", matrix, tangent), axis=-1) / pattern.in_ring[0]
+    for k in range(pattern.segments):
+        middle = reading.phase[row] + (k + 0.5) * pattern.step
+        around += reading.bits[row, k, None] * _window(_wrap(phi[None] - middle[:, None]), angular, pattern.step)
     around = (reading.level[row][:, None] * around).astype(x.dtype)
     cx, cy, b11, b12, b22, blur = (column.astype(x.dtype)[:, None] for column in (*xy.T, *b.T, s))
     dx, dy = x - cx, y - cy
@@ -276,10 +337,10 @@ def ring_glare(xy: Array, b: Array, s: Array, reading: RingReadings, row: Array,
     rho = np.maximum(np.sqrt(u * u + v * v), 1e-6)
     n1, n2 = u / rho, v / rho
     radial = blur * np.sqrt((b11 * n1 + b12 * n2) ** 2 + (b12 * n1 + b22 * n2) ** 2)
-    place = np.arctan2(v, u) % (2.0 * np.pi) * (_ANGLES / (2.0 * np.pi)) - 0.5
+    place = np.arctan2(v, u) % (2.0 * np.pi) * (count / (2.0 * np.pi)) - 0.5
     lower = np.floor(place)
     part, lower = place - lower, lower.astype(np.int64)
     rows = np.arange(len(xy))[:, None]
-    total = around[rows, lower % _ANGLES] * (1.0 - part) + around[rows, (lower + 1) % _ANGLES] * part
-    across = tail((2.0 - rho) / radial) - tail((3.0 - rho) / radial)
+    total = around[rows, lower % count] * (1.0 - part) + around[rows, (lower + 1) % count] * part
+    across = tail((pattern.inner - rho) / radial) - tail((pattern.outer - rho) / radial)
     return np.asarray(total * across)

@@ -80,8 +80,8 @@ def without_ring_parts(
     keep = np.ones(len(candidates), bool)
     for host in np.flatnonzero(readings.evidence):
         rho = _relative_radius(candidates.xy, dots.xy[host], dots.semi_axes[host], float(dots.angle[host]))
-        # a segment lies between 2 and 3; an uncoded dot of the same size would reach out of that band
-        keep &= ~((rho > 1.8) & (rho < 3.2))
+        # a segment lies in the ring; an uncoded dot of the same size would reach out of that band
+        keep &= ~((rho > readings.pattern.inner - 0.2) & (rho < readings.pattern.outer + 0.2))
     log.add_rows(candidates.xy[~keep], candidates.semi_axes[~keep, 0], Reason.RING_PART)
     return candidates.select(keep)
 
@@ -96,7 +96,7 @@ def without_duplicates(dots: FittedDots, readings: RingReadings, log: RejectionL
     rank[order] = np.arange(n)
     tree = cKDTree(dots.xy)
     keep = np.ones(n, bool)
-    reach = np.where(readings.code >= 0, 3.1, 0.9) * dots.semi_axes[:, 0]
+    reach = np.where(readings.code >= 0, readings.pattern.outer + 0.1, 0.9) * dots.semi_axes[:, 0]
     for row in order:
         if not keep[row]:
             continue
@@ -114,10 +114,10 @@ def without_duplicates(dots: FittedDots, readings: RingReadings, log: RejectionL
             rho = _relative_radius(
                 dots.xy[other : other + 1], dots.xy[row], dots.semi_axes[row], float(dots.angle[row])
             )[0]
-            ring = readings.code[row] >= 0 and rho < 3.05
+            ring = readings.code[row] >= 0 and rho < readings.pattern.outer + 0.05
             if rho < 0.9 or (ring and readings.code[other] < 0):
                 keep[other] = False
                 reason = Reason.RING_PART if ring else Reason.DUPLICATE
                 log.add(dots.xy[other, 0], dots.xy[other, 1], dots.semi_axes[other, 0], reason)
-    kept = RingReadings(*(getattr(readings, f)[keep] for f in RingReadings.__dataclass_fields__))
+    kept = readings.select(keep)
     return dots.select(keep), kept

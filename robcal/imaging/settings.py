@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from robcal.errors import InvalidInput
+from robcal.imaging.ring_code import RING12, RingPattern
 
 Polarity = Literal["bright", "dark"]
 
@@ -20,8 +21,8 @@ class DetectionSettings:
     min_contrast_sigma : contrast by background noise below which a blob is not looked at.
     max_misfit : RMS of the residuals that noise does not explain, by contrast, above which a blob is no dot (clean dots
         stay below 0.03, unevenly lit balls reach 0.15; the covariance grows with it).
-    ring12 : read ring12 codes.
-    known_codes : the ring12 ids that can occur; any other reading is then no code. None: any.
+    ring12 : read ring codes. ring : how they are printed, default ring12.
+    known_codes : the ids of rings that can occur; any other reading is then no code. None: any.
     aruco : OpenCV dictionary of square markers to look for, as "4X4_50" or "DICT_4X4_50"; None: none.
     saturation_level : grey value from which a pixel counts as saturated; None: found from the image.
     coarse : where most candidates are refused, add coarse dots (:mod:`robcal.imaging.coarse_dots`), for bodies that
@@ -36,6 +37,7 @@ class DetectionSettings:
     min_contrast_sigma: float = 8.0
     max_misfit: float = 0.15
     ring12: bool = True
+    ring: RingPattern = RING12
     known_codes: frozenset[int] | None = None
     aruco: str | None = None
     saturation_level: float | None = None

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from robcal.programs.constants import several
 from robcal.programs.targets import FrameOf, Hint, Program, Stated, Target, Unclear
@@ -82,7 +82,7 @@ def correct(
     wanted, q, notes = _believed(program, chain, tools, bases, near)
     edits: list[list[Edit]] = [[] for _ in program.sources]
     before, remaining = np.zeros((len(q), 6)), np.zeros((len(q), 6))
-    rotary = ~chain.prismatic
+    rotary = ~_track(chain)
     for rows in _alike(tools):
         found = _compensated(kernel, tools[rows[0]], wanted[rows], q[rows], payload, covariates)
         _check(program, rows, found, chain, q)
@@ -167,6 +167,11 @@ def _believed(
     wanted = np.empty((len(targets), 4, 4))
     for row, target in enumerate(targets):
         if target.literal.T is None:
+            if np.any(chain.prismatic & ~_track(chain)):
+                raise Refusal(
+                    f"{target.file}, line {target.line}: joint targets of an arm with a sliding joint are refused, "
+                    "Cartesian ones are corrected; nothing was written"
+                )
             q[row] = _joint_values(target, chain, np.asarray(target.literal.axes))
             wanted[row] = forward(chain, q[row][None])[0] @ tools[row]
         else:
@@ -179,8 +184,8 @@ def _believed(
         if target.literal.T is not None:
             one = solutions[row]
             now = one.near[0] if current is None else np.asarray(current, dtype=float)
-            if np.any(chain.prismatic):
-                now = _joint_values(target, chain, now[~chain.prismatic])
+            if np.any(_track(chain)):
+                now = _joint_values(target, chain, now[~_track(chain)])
                 one = inverse_kinematics(chain, one.base_T_flange, now)
             found, fits = _configuration(one, target.literal.hint, now)
             if found is None:
@@ -220,7 +225,7 @@ def _configuration(one: InverseSolutions, hint: Hint, current: Array) -> tuple[A
     """The joint values (N,) that a target asks for, or the nearest ones, and whether they are what it asks for."""
     chain = one.chain
     near = current.copy()
-    rotary = np.flatnonzero(~chain.prismatic)
+    rotary = np.flatnonzero(~_track(chain))
     if hint.near is not None and len(hint.near) == len(rotary):
         near[rotary] = hint.near
     best: tuple[tuple[int, float], Array] | None = None
@@ -248,9 +253,14 @@ def _configuration(one: InverseSolutions, hint: Hint, current: Array) -> tuple[A
     return (best[1], True) if best[0][0] == 0 else (nearest[1], False)
 
 
+def _track(chain: Chain) -> NDArray[np.bool_]:
+    """Sliding joints under the arm (N,), which controllers call external axes."""
+    return np.asarray(np.logical_and.accumulate(chain.prismatic))
+
+
 def _joint_values(target: Target, chain: Chain, axes: Array) -> Array:
     """Joint values (N,) of rotary axes and of the external ones that are joints of the robot."""
-    rotary, sliding = np.flatnonzero(~chain.prismatic), np.flatnonzero(chain.prismatic)
+    rotary, sliding = np.flatnonzero(~_track(chain)), np.flatnonzero(_track(chain))
     literal = target.literal
     track = [value for value in literal.external[: len(sliding)] if value is not None]
     if len(axes) < len(rotary) or len(track) < len(sliding):
@@ -273,7 +283,7 @@ def _check(program: Program, rows: Sequence[int], found: Compensation, chain: Ch
             refusals.append(Refusal(f"{where}: the corrected target is out of reach: {found.reason[k]}"))
         elif not found.converged[k]:
             refusals.append(Refusal(f"{where}: the target is met only approximately (near a singular pose?)"))
-        elif np.max(np.abs((found.q[k] - q[row])[chain.prismatic]), initial=0.0) > 1e-9:
+        elif np.max(np.abs((found.q[k] - q[row])[_track(chain)]), initial=0.0) > 1e-9:
             refusals.append(Refusal(f"{where}: the target is out of reach with the external axis where it is"))
     if refusals:
         raise several(refusals)

@@ -1,5 +1,7 @@
 """The dialects by name and by the suffix of a program's file."""
 
+import math
+import re
 from collections.abc import Callable, Mapping
 
 from robcal.errors import InvalidInput
@@ -7,7 +9,7 @@ from robcal.programs.fanuc import read_fanuc
 from robcal.programs.krl import read_krl
 from robcal.programs.rapid import read_rapid
 from robcal.programs.targets import Program
-from robcal.programs.text import SHORT_MARK, Source
+from robcal.programs.text import NUMBER, SHORT_MARK, Source
 from robcal.programs.urscript import read_urscript
 
 READERS: Mapping[str, Callable[[Source], Program]] = {
@@ -55,6 +57,9 @@ def read_program(dialect: str, source: Source, data: Source | None = None) -> Pr
                     sum(len(part) for part in text.text.splitlines(keepends=True)[: number - 1]),
                     "the program is corrected already: correct the one that it was made from",
                 )
+        endless = next((m for m in re.finditer(NUMBER, text.text) if float(m[0]) == math.inf), None)
+        if endless is not None:
+            raise text.refuse(endless.start(), f"the number {endless[0][:20]} is beyond all measure")
         if "\x00" in text.text:
             raise text.refuse(text.text.index("\x00"), "not a text in one byte a character: save it as ANSI or UTF-8")
     return read_krl(source, data) if dialect == "krl" else READERS[dialect](source)

@@ -4,6 +4,7 @@ from collections.abc import Collection
 
 from robcal.errors import InvalidInput
 from robcal.files.body_file import BodyFile
+from robcal.imaging.ring_code import ring_segments
 from robcal.imaging.settings import DetectionSettings
 
 _MANY = 12
@@ -25,7 +26,7 @@ def detection_settings(body: BodyFile, ends: Collection[int] | None) -> Detectio
     dictionaries = sorted({c.removeprefix("aruco:") for c in codes if c is not None and c.startswith("aruco:")})
     if len(dictionaries) > 1:
         raise InvalidInput(f"{body.path}: markers of several dictionaries ({', '.join(dictionaries)}): use one")
-    ring = {t.id for t in body.targets if t.code == "ring12" and t.id is not None}
+    ring = {t.id for t in body.targets if ring_segments(t.code) is not None and t.id is not None}
     known = ring | set(ends or ())
     polarities = {t.polarity for t in body.targets}
     if len(polarities) > 1:
@@ -33,6 +34,7 @@ def detection_settings(body: BodyFile, ends: Collection[int] | None) -> Detectio
     return DetectionSettings(
         polarity="dark" if polarities == {"dark"} else "bright",
         ring12=bool(known) or not any(codes),
+        ring=body.ring,
         known_codes=frozenset(known) if ring else None,
         aruco=dictionaries[0] if dictionaries else None,
         # many uncoded dots are found by their arrangement: then a rough centre is better than none

@@ -31,4 +31,5 @@ def noise_of(identification: Identification, robot: CalibratedRobot, log: JointL
         stated=recording.stated,
         lever=lever,
         weighted=recording.weighted,
+        left=robot.covariance_scale,
     )

@@ -97,3 +97,13 @@ def test_distances() -> None:
     found = noise_parts(rng.uniform(-1, 1, (50, 6)), SIGMA * rng.normal(size=(50, 1)), 6, [o], stated=True, lever=LEVER)
     assert found.measurement == pytest.approx(SIGMA)
     assert found.lack_of_fit < SIGMA
+
+
+def test_noise_is_no_larger_than_what_is_left() -> None:
+    rng = np.random.default_rng(2)
+    q, residuals = rng.uniform(-1, 1, (60, 6)), SIGMA * rng.normal(size=(60, 3))
+    frames = FrameObservations.isotropic(np.broadcast_to(np.eye(4), (60, 4, 4)), 4 * SIGMA, 1e-5)
+    found = noise_parts(q, residuals, 0, [frames], stated=True, lever=LEVER, left=1 / 16)
+    assert found.source == "residuals"
+    assert found.measurement == pytest.approx(np.sqrt(3) * SIGMA)
+    assert found.stated == pytest.approx(np.sqrt(3) * 4 * SIGMA)

@@ -196,3 +196,9 @@ def test_files_that_are_no_campaign(tmp_path: Path, text: str) -> None:
     code, errors, _ = check(tmp_path)
     assert code == 1
     assert errors
+
+
+@pytest.mark.parametrize("name", ["CON", "nul.txt", "cell 7.", "com3"])
+def test_names_that_windows_takes_for_no_folder(point_campaign: Path, name: str) -> None:
+    edit_yaml(point_campaign / "campaign.yaml", lambda d: d.update(name=name))
+    assert told(check(point_campaign)[1], "campaign.yaml", "cannot be a folder on Windows")

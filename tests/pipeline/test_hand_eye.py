@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 import yaml
 
+from fixtures.board_pattern import BoardPattern
 from fixtures.campaigns import write_table, write_yaml
-from fixtures.hand_eye import Scene, exchanged, place, scene, turn
-from fixtures.hand_eye_files import write_scene
+from fixtures.hand_eye import Scene, exchanged, looking, place, scene, turn
+from fixtures.hand_eye_files import write_images, write_scene
+from fixtures.optics import TrueCamera
 from fixtures.true_robot import Circumstances, TrueRobot
 from pipeline.pose_generation import generate_poses
 from pipeline.prediction import predict_run
@@ -217,3 +219,19 @@ def test_the_next_poses_are_proposed_from_guesses_and_from_a_run(hand_run, tmp_p
     write_yaml(tmp_path / "again.yaml", base | {"hand_eye": {"run": str(run)}})
     told = generate_poses(tmp_path / "again.yaml", tmp_path / "again.csv")
     assert np.linalg.norm(told["sigma_mm"]) < 0.2
+
+
+@pytest.mark.slow
+def test_from_rendered_images_of_a_charuco_board(tmp_path: Path) -> None:
+    pattern = BoardPattern("charuco", 7, 5, square=0.03, marker=0.022)
+    camera = TrueCamera(560, 420, 640.0, 640.0, 281.0, 208.0, k1=-0.1, psf_px=0.7)
+    rng = np.random.default_rng(3)
+    marks = np.column_stack([pattern.marks(), np.zeros(len(pattern.marks()))])
+    views = np.array([looking(rng, marks, (0.3, 0.42), 0.6, np.pi) for _ in range(6)])
+    seen = scene(rng, "hand", views=views, scatter=(1e-4, 1e-4))
+    folder = write_images(tmp_path / "c", pattern, camera, seen, views)
+    found = run_campaign(folder, tmp_path / "r").result["hand_eye"]
+    assert found["images"] == 6
+    assert np.all(np.abs(error_in_sigmas(found["flange_T_camera"], seen.X)) < 5)
+    assert found["heldout_px"] < 1.0
+    assert found["noise_px"] < 0.1

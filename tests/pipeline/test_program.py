@@ -82,6 +82,18 @@ def test_a_program_and_its_data_are_corrected(run: Path, files: Path) -> None:
     assert dat.splitlines()[-1] == b"ENDDAT"
 
 
+def test_files_that_hold_a_frame_alone_will_do(run: Path, files: Path) -> None:
+    with_format = json.loads(program(run, files, *frames(files), "--json", "-q").splitlines()[-1])
+    texts = [Path(path).read_bytes() for path in with_format["out"]]
+    for name in ("tool", "base"):
+        path = files / f"{name}.yaml"
+        path.write_text("".join(line for line in path.read_text().splitlines(True) if not line.startswith("format")))
+    program(run, files, *frames(files))
+    assert [Path(path).read_bytes() for path in with_format["out"]] == texts
+    (files / "tool.yaml").write_text("flange_T_tool: {xyz_mm: [1, 2]}\n")
+    assert "xyz_mm must be three numbers" in program(run, files, *frames(files), ok=False)
+
+
 def test_a_corrected_program_is_refused(run: Path, files: Path) -> None:
     program(run, files, *frames(files))
     (files / "part.src").write_bytes((files / "corrected" / "part.src").read_bytes())

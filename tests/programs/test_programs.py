@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 
 from fixtures.rigid import Array, frame_from_six
+from robcal.files.robot_import import read_any_robot
 from robcal.programs.correction import Corrected, GivenFrames, correct
 from robcal.programs.dialects import COMMENTS, read_program
 from robcal.programs.text import MARK, SHORT_MARK, Refusal, Source
+from robcal.robot.chain import chain_of, forward
 from robcal.robot.kernel import Kernel
 from robcal.robot.model import Frame, RobotModel
 from tests.programs import fanuc_programs, krl_programs, rapid_programs, urscript_programs
@@ -241,6 +243,30 @@ def test_the_configuration_that_a_target_states_is_kept(dialect: str, kernel: Ke
     new = commanded(motions(dialect, found.texts[0], "")[0], q)
     assert found.notes == ()
     assert np.max(np.abs(_twist(nominal(q)[0], true(new)[0]))) < EXACT[dialect]
+
+
+@pytest.mark.parametrize(
+    ("name", "q", "external"),
+    [
+        ("scara_600", [0.3, 0.8, 0.05, 0.2], ""),
+        ("kr150_class_on_track", [1, 0.3, -0.9, 1.6, 0.5, 0.6, -0.7], ", E1 1000"),
+    ],
+)
+def test_other_arms(name: str, q: list[float], external: str) -> None:
+    """An arm of four joints, and one on a track that stands where the target says."""
+    model = read_any_robot(f"configs/robots/{name}.yaml")
+    T = forward(chain_of(model), np.array([q]))[0]
+    text = f"$TOOL=$NULLFRAME\n$BASE=$NULLFRAME\nLIN {{{written(T, 'krl')}{external}}}\n"
+    off = Kernel(model.with_parameters({f"{model.joints[1].name}.x": 1e-3}))
+    found = correct(read_program("krl", Source("in", text)), off, GivenFrames({}, {}), near=q)
+    assert np.linalg.norm(found.before[0, :3]) == pytest.approx(1e-3, abs=1e-5)
+    assert np.max(np.abs(found.remaining[0, :3])) < 1e-8
+    assert external in found.texts[0]
+
+
+def test_numbers_beyond_all_measure_are_refused(kernel: Kernel) -> None:
+    with pytest.raises(Refusal, match="line 2: the number 1e999"):
+        correct_text("krl", "DEF a()\nPTP {A1 1e999,A2 0,A3 0,A4 0,A5 0,A6 0}\nEND\n", kernel)
 
 
 def test_columns_of_numbers_stay_columns(kernel: Kernel) -> None:

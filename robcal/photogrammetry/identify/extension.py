@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 
 from robcal.imaging.detections import Detections, TargetKind
+from robcal.imaging.ring_code import ring_segments
 from robcal.photogrammetry.core.bodies import Body, IntArray
 from robcal.photogrammetry.core.camera import Camera, project_with_jacobians
 from robcal.photogrammetry.core.eccentricity import effective_point
@@ -63,7 +64,7 @@ def predict_dots(
     with np.errstate(invalid="ignore", divide="ignore"):
         size = camera.fx * 0.5 * body.diameters[targets] / p[:, 2]
     gate = np.where(np.isfinite(variance), _GATE * np.sqrt(np.maximum(variance, 0.01)), 0.0)
-    ringed = np.array([code == "ring12" for code in body.codes], dtype=bool)[targets] & np.isfinite(size)
+    ringed = np.array([ring_segments(code) is not None for code in body.codes], dtype=bool)[targets] & np.isfinite(size)
     gate = np.where(ringed, np.minimum(gate, np.maximum(_INSIDE_RING * size, _LEAST_GATE)), gate)
     return xy, gate, size
 

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robcal.imaging.detections import Detections, TargetKind
+from robcal.imaging.ring_code import ring_segments
 from robcal.photogrammetry.boards.layout import CIRCLE, CORNER
 from robcal.photogrammetry.core.bodies import Body, IntArray
 from robcal.photogrammetry.core.camera import Camera
@@ -213,7 +214,7 @@ def _uncoded(body: Body) -> NDArray[np.bool_]:
 
 def coded_rows(detections: Detections, body: Body) -> tuple[IntArray, IntArray]:
     """Rows and ids of dots whose code belongs to the body; a code seen twice is no identification."""
-    ring = np.array([c == "ring12" for c in body.codes], dtype=bool)
+    ring = np.array([ring_segments(c) is not None for c in body.codes], dtype=bool)
     marker = np.array([c is not None and c.startswith("aruco") for c in body.codes], dtype=bool)
     code = detections.code
     ok = np.zeros(len(code), dtype=bool)
