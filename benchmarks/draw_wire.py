@@ -38,8 +38,8 @@ def errors(seed: int) -> tuple[float, float, float, int]:
         world_T_base=made.world_T_base["wire"], flange_T_tool=made.flange_T_tool["wire"]
     ).world_T_tool(kept.q, kept.circumstances)[:, :3, 3]
     T, covariance = robot.predict(robot.kernel.poses(kept.q, kept.circumstances.payload))
-    bare = robot.bare()
-    nominal, _ = bare.predict(bare.kernel.poses(kept.q, kept.circumstances.payload))
+    uncalibrated = robot.uncalibrated()
+    nominal, _ = uncalibrated.predict(uncalibrated.kernel.poses(kept.q, kept.circumstances.payload))
     missed = [1e3 * float(np.sqrt(np.mean(np.sum((f[:, :3, 3] - true) ** 2, axis=1)))) for f in (nominal, T)]
     predicted = 1e3 * float(np.sqrt(np.mean(np.trace(covariance[:, :3, :3], axis1=1, axis2=2))))
     return *missed, predicted, len(set(robot.names) & set(MODEL))

@@ -57,7 +57,7 @@ def cell_tcp(run: Path, touches: Path, out: Path, touch_mm: float | None = None)
     if "tip" not in points:
         raise InvalidInput(f"{touches}: the point 'tip' was not touched: touch the fixed tip with the tool's own tip")
     flange = carried_frames(robot, robot.inputs(table.log), FLANGE)
-    found = _told(touches, lambda: tool_from_touches(flange, points, _metres(touch_mm)))
+    found = _with_path(touches, lambda: tool_from_touches(flange, points, _metres(touch_mm)))
     return _frame_answer("flange_T_tool", found, table.points, out, _notes(table, found))
 
 
@@ -74,10 +74,10 @@ def cell_object(
     sigma = _metres(touch_mm)
     if nominal is None:
         _check_names(touches, table.points, CORNERS, "without --nominal the frame is spanned by these")
-        found = _told(touches, lambda: object_from_corners(tip, table.points, sigma))
+        found = _with_path(touches, lambda: object_from_corners(tip, table.points, sigma))
     else:
         xyz, held = read_nominal(nominal, table, touches)
-        found = _told(touches, lambda: object_from_points(tip, xyz, held, sigma))
+        found = _with_path(touches, lambda: object_from_points(tip, xyz, held, sigma))
     _check_tool(touches, tool, found.adjusted)
     return _frame_answer("base_T_object", found, table.points, out, _notes(table, found))
 
@@ -131,7 +131,7 @@ def cell_probe(frames: Path, out: Path, touch_mm: float | None = None) -> dict[s
     """
     names = read_table(frames).texts("pose") if read_table(frames).has("pose") else ()
     measured, covariance, stated = _frames_of(frames, names)
-    found = _told(frames, lambda: pivot(measured, covariance if stated else None, _metres(touch_mm)))
+    found = _with_path(frames, lambda: pivot(measured, covariance if stated else None, _metres(touch_mm)))
     return _frame_answer("flange_T_tool", found, ("tip",) * len(measured), out, [])
 
 
@@ -178,7 +178,7 @@ def _check_tool(path: Path, tool: Path | None, adjusted: Adjusted) -> None:
     )
 
 
-def _told(path: Path, work: Callable[[], CellFrame]) -> CellFrame:
+def _with_path(path: Path, work: Callable[[], CellFrame]) -> CellFrame:
     """Do the work; what geometry or numbers lack is said with the file's name."""
     try:
         return work()

@@ -182,7 +182,7 @@ def compare_runs(database: str, before: str, after: str) -> dict[str, Any]:
     InvalidInput : a run is not there, or they have no parameters in common.
     """
     rows = [_either(database, key) for key in (before, after)]
-    return _told(rows[0], rows[1])
+    return _comparison(rows[0], rows[1])
 
 
 def changes_of(database: str, robot: str, days: float) -> dict[str, Any]:
@@ -198,7 +198,7 @@ def changes_of(database: str, robot: str, days: float) -> dict[str, Any]:
     times = [dt.datetime.fromisoformat(row["measured_at"]) for row in listed]
     wanted = times[-1] - dt.timedelta(days=days)
     nearest = min(range(len(listed) - 1), key=lambda k: abs((times[k] - wanted).total_seconds()))
-    return _told(*(_row(database, str(listed[k]["id"])) for k in (nearest, -1)))
+    return _comparison(*(_row(database, str(listed[k]["id"])) for k in (nearest, -1)))
 
 
 def _either(database: str, key: str) -> dict[str, Any]:
@@ -222,7 +222,7 @@ def _either(database: str, key: str) -> dict[str, Any]:
     return _row(database, key)
 
 
-def _told(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, Any]:
+def _comparison(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, Any]:
     members = [_member(row) for row in (before, after)]
     found = change(*members)
     units = dict(zip(after["parameters"]["names"], after["parameters"]["units"], strict=True))

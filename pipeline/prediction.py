@@ -36,7 +36,7 @@ def predict_run(
     """
     calibrated = robot_in_force(folder, at_cycle, instrument)
     wanted = read_poses(poses, calibrated.model, calibrated.model.payloads, to_predict=True)
-    robot = calibrated.bare() if nominal else calibrated
+    robot = calibrated.uncalibrated() if nominal else calibrated
     T, covariance = robot.predict(robot.inputs(wanted))
     columns: dict[str, Sequence[object]] = {"pose": wanted.names, **frame_columns(T)}
     if not nominal:

@@ -117,10 +117,10 @@ def keep_inputs_apart(campaign: Campaign, run: Run) -> None:
     recorded = {path.parent.resolve() for path in (*campaign.files, *images)}
     if out in recorded:
         raise InvalidInput(f"{run.folder}: holds recordings of the campaign: choose another --out")
-    strangers = [path.name for path in run.contract_files() if path.exists()]
-    if strangers and not run_file(run).is_file():
+    others = [path.name for path in run.contract_files() if path.exists()]
+    if others and not run_file(run).is_file():
         raise InvalidInput(
-            f"{run.folder}: is no run folder but holds {strangers[0]}, which would be overwritten: choose another --out"
+            f"{run.folder}: is no run folder but holds {others[0]}, which would be overwritten: choose another --out"
         )
 
 

@@ -95,7 +95,7 @@ def _sizes(images: ImageSource, sizes: dict[tuple[int, int], Path]) -> list[str]
     where = f"camera file {images.start_path} says" if images.start_path else "others have"
     return [
         f"{path}: {size[0]} x {size[1]} px, but {where} {expected[0]} x {expected[1]}: one camera takes images of one "
-        "size, remove the strangers or correct the camera file"
+        "size, remove the others or correct the camera file"
         for size, path in sizes.items()
         if expected is not None and size != expected
     ]

@@ -40,12 +40,12 @@ def verdict_of(material: Material) -> Verdict:
             "The run holds no verified robot and no survey.",
             "See the chapters below.",
             "Nothing yet.",
-            told_diagnosis(material),
+            diagnosis_sentence(material),
         )
     return Verdict("none", "Nothing done yet", "No stage of this campaign has finished.", "–", "Nothing yet.")
 
 
-def told_diagnosis(material: Material) -> str:
+def diagnosis_sentence(material: Material) -> str:
     """The diagnosis in one sentence, empty without one."""
     d = material.diagnosis
     if d is None:
@@ -103,7 +103,7 @@ def _robot(material: Material, v: Verification) -> Verdict:
         f"{change}{but}.",
         reason,
         load,
-        told_diagnosis(material),
+        diagnosis_sentence(material),
         _keys(material, v, noise, gain),
         error_table(v, noise, full=False),
     )
@@ -216,7 +216,7 @@ def _measuring(material: Material) -> Verdict:
         _sentence(judged.reasons),
         ("bodies/*.yaml (surveyed coordinates with sigmas) and " if material.surveys else "")
         + "cameras/*.yaml (calibrated cameras).",
-        told_diagnosis(material),
+        diagnosis_sentence(material),
         tuple(judged.keys),
     )
 

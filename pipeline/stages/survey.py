@@ -39,8 +39,11 @@ def work(context: Context) -> Outcome:
         outputs += _write(run, name, source, body, done)
         notes += [f"survey of '{name}': {note}" for note in survey_notes(done)]
         doubts = _against_given(campaign, source, done)
-        notes += doubts.told(name)
-        results[name] = survey_section(done) | {"contradictions": doubts.told(name), "mirrored_mm": doubts.mirrored_mm}
+        notes += doubts.sentences(name)
+        results[name] = survey_section(done) | {
+            "contradictions": doubts.sentences(name),
+            "mirrored_mm": doubts.mirrored_mm,
+        }
     return Outcome({"survey": results}, outputs, notes)
 
 

@@ -91,7 +91,7 @@ class CalibratedRobot:
         given = {name: np.full(len(log), value) for name, value in self.defaults.items()}
         return self.kernel.poses(log.q, log.payload, {**given, **log.stated()})
 
-    def bare(self) -> "CalibratedRobot":
+    def uncalibrated(self) -> "CalibratedRobot":
         """The nominal robot in the best cell.
 
         Raises

@@ -156,7 +156,7 @@ def master(
     start = _start(kernel, reference, free)
     wanted = _wanted(problem, known, joints, free, approach)
     carried = _held(robot, problem, start, free)
-    chosen, gone = _told(problem, start, carried, wanted)
+    chosen, gone = _distinguishable(problem, start, carried, wanted)
     if not any(problem.names[k] in known for k in chosen):
         raise NotIdentifiable("the measurements tell none of the offsets: measure more targets, or more poses")
 
@@ -209,7 +209,7 @@ def _held(robot: CalibratedRobot, problem: _Problem, start: _State, free: Sequen
     return CarriedFrames(T, names, robot.covariance[np.ix_(keep, keep)], J, moved @ np.swapaxes(moved, 1, 2))
 
 
-def _told(
+def _distinguishable(
     problem: _Problem, start: _State, carried: CarriedFrames, wanted: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], list[tuple[Eliminated, list[str]]]]:
     """Unknowns that the measurements tell apart, and the others with what they are tied to."""

@@ -160,11 +160,11 @@ def parse_payload(table: Table, payloads: Collection[str]) -> tuple[str | None, 
     cells = table.columns["payload"]
     known = sorted(payloads)
 
-    def told(i: int) -> str:
+    def sentence(i: int) -> str:
         remedy = proposal(cells[i], known) or ": the campaign lists none"
         return f"payload '{cells[i][:60]}' is not known{remedy}; add it to 'payloads' in campaign.yaml"
 
-    table.refuse([cell not in payloads and cell.lower() not in NO_PAYLOAD for cell in cells], told)
+    table.refuse([cell not in payloads and cell.lower() not in NO_PAYLOAD for cell in cells], sentence)
     return tuple(cell if cell in payloads else None for cell in cells)
 
 

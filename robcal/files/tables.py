@@ -64,9 +64,9 @@ class Table:
 
     def error(self, record: int, message: str) -> FaultyRows:
         """An error that names file and row."""
-        return FaultyRows([self._told(record, message)], self.without([record]))
+        return FaultyRows([self._located(record, message)], self.without([record]))
 
-    def _told(self, record: int, message: str) -> str:
+    def _located(self, record: int, message: str) -> str:
         return f"{self.path}, row {int(self.rows[record])}: {message}"
 
     def refuse(self, bad: ArrayLike, message: Callable[[int], str]) -> None:
@@ -78,7 +78,7 @@ class Table:
         """
         records = np.flatnonzero(bad)
         if len(records):
-            faults = [self._told(int(i), message(int(i))) for i in records[:MOST_TOLD]]
+            faults = [self._located(int(i), message(int(i))) for i in records[:MOST_TOLD]]
             if len(records) > MOST_TOLD:
                 faults.append(f"{self.path}: {len(records) - MOST_TOLD} more rows like these")
             raise FaultyRows(faults, self.without(records))
@@ -146,11 +146,11 @@ class Table:
         seen: dict[tuple[str, ...], int] = {}
         first = [seen.setdefault(key, i) for i, key in enumerate(keys)]
 
-        def told(i: int) -> str:
+        def sentence(i: int) -> str:
             what = ", ".join(f"{name} {cell}" for name, cell in zip(names, keys[i], strict=True))
             return f"{what} stands twice (first in row {int(self.rows[first[i]])}): remove one of them"
 
-        self.refuse(np.array(first, dtype=np.int64) != np.arange(len(keys)), told)
+        self.refuse(np.array(first, dtype=np.int64) != np.arange(len(keys)), sentence)
 
 
 def _float_or_nan(cell: str) -> float:

@@ -55,9 +55,9 @@ def identify_from_instruments(
     notes += told
     found = identify_instruments(start, log, instruments, options)
     found = replace(found, notes=(*found.notes, *length_alarms(found)))
-    silent = [i.name for i in instruments if not i.recording.stated]
-    if silent:
-        notes.append(f"{' and '.join(silent)}: no uncertainty is stated, it is estimated from the residuals")
+    unstated = [i.name for i in instruments if not i.recording.stated]
+    if unstated:
+        notes.append(f"{' and '.join(unstated)}: no uncertainty is stated, it is estimated from the residuals")
     return replace(found, notes=(*notes, *found.notes))
 
 

@@ -213,8 +213,8 @@ def outside_limits(model: RobotModel, poses: PoseInputs) -> list[tuple[int, str,
     out = []
     for k, f in enumerate(model.joints):
         if f.limits is not None:
-            slack = 1e-6 + 1e-3 * (f.limits[1] - f.limits[0])
-            far = (poses.q[:, k] < f.limits[0] - slack) | (poses.q[:, k] > f.limits[1] + slack)
+            tolerance = 1e-6 + 1e-3 * (f.limits[1] - f.limits[0])
+            far = (poses.q[:, k] < f.limits[0] - tolerance) | (poses.q[:, k] > f.limits[1] + tolerance)
             out += [(int(row), f.name, float(poses.q[row, k])) for row in np.flatnonzero(far)]
     return sorted(out)
 

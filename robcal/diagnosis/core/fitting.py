@@ -167,21 +167,21 @@ def fit(
     linearised = partial(_linearised, kernel, recording, inputs, columns, direct)
 
     width = len(names) + sum(len(item.names) for item in direct)
-    brake = np.diag(damping(names, width, kernel.variables(theta, inputs)))[: len(names)]
+    bounds = np.diag(damping(names, width, kernel.variables(theta, inputs)))[: len(names)]
     sizes = {f"{term.name}.{short}": size for term in model.terms for short, size in term.priors.items()}
     held = np.array([k for k, name in enumerate(names) if name in sizes], dtype=np.intp)
     prior = np.zeros((len(held), width))
-    scale, room = 0.0, 1.0
+    scale, trust = 0.0, 1.0
     best: tuple[float, Array, Array, Array] | None = None
     for _ in range(iterations):
         _, residual, jacobian = linearised(theta)
         cost = _least(residual, jacobian[:, len(columns) :])
         if best is None or cost <= best[0]:
             # as long as steps keep their promise the damping fades, and the last ones are undamped
-            room = room if best is None else room * RELEASE
+            trust = trust if best is None else trust * RELEASE
             best = (cost, theta.copy(), residual, jacobian)
         else:
-            room /= RELEASE**2
+            trust /= RELEASE**2
             theta, residual, jacobian = best[1].copy(), best[2], best[3]
         if len(held):
             # a prior weighs against observations of the variance that they show
@@ -189,8 +189,8 @@ def fit(
             prior[np.arange(len(held)), held] = [scale / sizes[names[k]] for k in held]
         # steps are damped by the size that deviations can have: near-parallel axes leave directions that a full
         # step would follow beyond all linearity
-        rows = np.concatenate([residual, np.zeros(len(brake)), -prior[:, held] @ theta[columns[held]]])
-        step = solve(np.vstack([jacobian, brake / room, prior]), rows)[: len(columns)]
+        rows = np.concatenate([residual, np.zeros(len(bounds)), -prior[:, held] @ theta[columns[held]]])
+        step = solve(np.vstack([jacobian, bounds / trust, prior]), rows)[: len(columns)]
         if len(held):
             left = residual - jacobian[:, : len(columns)] @ step
             scale = float(np.sqrt(left @ left / max(len(left) - width, 1)))
@@ -248,8 +248,8 @@ def _least(residual: Array, columns: Array) -> float:
 def damping(names: Sequence[str], columns: int, variables: Mapping[str, Array]) -> Array:
     """Reciprocals (columns,) of the largest steps that make sense for named parameters; zero for amplitudes."""
     largest = LARGEST_STEP * prior_scales(names, variables)
-    brakes = np.where(largest > 0, 1.0 / np.where(largest > 0, largest, 1.0), 0.0)
-    return np.concatenate([brakes, np.zeros(columns - len(names))])
+    bounds = np.where(largest > 0, 1.0 / np.where(largest > 0, largest, 1.0), 0.0)
+    return np.concatenate([bounds, np.zeros(columns - len(names))])
 
 
 def _amplitudes(

@@ -123,9 +123,9 @@ def extrapolated(recording: Recording, fitted: Fit, region: Array) -> float:
     test = region[fitted.row_pose]
     per = len(fitted.residual) // len(recording.observations.pose)
     variables = fitted.kernel.variables(fitted.theta, fitted.inputs)
-    brakes = np.diag(damping(fitted.free, fitted.jacobian.shape[1], variables))
-    rows = np.vstack([fitted.jacobian[~test], brakes, fitted.prior])
-    step = solve(rows, np.concatenate([fitted.residual[~test], np.zeros(len(brakes)), fitted.prior_residual]))
+    bounds = np.diag(damping(fitted.free, fitted.jacobian.shape[1], variables))
+    rows = np.vstack([fitted.jacobian[~test], bounds, fitted.prior])
+    step = solve(rows, np.concatenate([fitted.residual[~test], np.zeros(len(bounds)), fitted.prior_residual]))
     predicted = np.where(test, fitted.residual - fitted.jacobian @ step, 0.0)
     errors = recording.unwhiten(predicted[:, None], fitted.frames)[:, : min(per, 3), 0]
     return rms(errors[region[recording.observations.pose]])

@@ -46,7 +46,7 @@ class GivenCoordinates:
             f"{other:.2g} mm)"
         )
 
-    def told(self, body: str) -> list[str]:
+    def sentences(self, body: str) -> list[str]:
         """One sentence for each contradiction."""
         out = []
         for number, deviation, sigma in self.contradicting:

@@ -36,7 +36,7 @@ def test_one_target_off(target: int, by: float, stated: bool) -> None:
     assert number == IDS[target]
     assert deviation == pytest.approx(by, rel=0.2)
     assert np.isfinite(sigma) == stated
-    assert f"target {number} of 'plate' contradict the survey" in found.told("plate")[0]
+    assert f"target {number} of 'plate' contradict the survey" in found.sentences("plate")[0]
 
 
 @pytest.mark.parametrize("axis", range(3))
