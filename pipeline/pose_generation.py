@@ -196,7 +196,8 @@ def _check_radius(body: Body, radius: float | None, path: Path) -> None:
 
 
 def _robot(entry: PosesEntry, config: Path) -> RobotModel:
-    model = read_any_robot(config.parent / entry.robot)
+    place = config.parent / entry.robot
+    model = read_any_robot(place / "robot_calibrated.yaml" if place.is_dir() else place)
     return replace(model, payloads={**model.payloads, **{name: p.payload() for name, p in entry.payloads.items()}})
 
 
@@ -225,10 +226,15 @@ def _cell(entry: PosesEntry, config: Path, model: RobotModel) -> Cell:
     if views and entry.body is None:
         raise InvalidInput(f"{config}: cameras are given but no body for them to see: name its targets under body")
     body = None
+    # a calibrated robot gives the frames that are not stated
+    stated = "world_T_base" in entry.model_fields_set or model.world_T_base is None
+    world_T_base = entry.world_T_base.matrix() if stated else np.asarray(model.world_T_base)
     flange_T_body, facing = np.eye(4), (0.0, 0.0, 1.0)
     if entry.body is not None:
         body = body_from_file(Path(entry.body.targets).stem, read_body(folder / entry.body.targets))
-        flange_T_body, facing = entry.body.flange_T_body.matrix(), entry.body.facing
+        stated = "flange_T_body" in entry.body.model_fields_set or model.flange_T_tool is None
+        flange_T_body = entry.body.flange_T_body.matrix() if stated else np.asarray(model.flange_T_tool)
+        facing = entry.body.facing
         if not any(facing):
             raise InvalidInput(f"{config}: body.facing is a direction, it must not be zero")
     rules = entry.visibility
@@ -236,7 +242,7 @@ def _cell(entry: PosesEntry, config: Path, model: RobotModel) -> Cell:
         raise InvalidInput(f"{config}: visibility.cameras asks for {rules.cameras} cameras, {len(views)} are given")
     capsules, obstacles = _bodies(entry, config, model)
     return Cell(
-        world_T_base=entry.world_T_base.matrix(),
+        world_T_base=world_T_base,
         flange_T_body=flange_T_body,
         body=body,
         viewpoints=tuple(views),

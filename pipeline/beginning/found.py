@@ -147,7 +147,10 @@ def _table(path: Path) -> TableFound | None:
         return None
     if is_joint_log(path):
         return TableFound(path, "poses", read_controller_log(path).columns["pose"])
-    text = read_bytes(path, MAX_BYTES).decode("utf-8-sig", errors="replace")
+    raw = read_bytes(path, MAX_BYTES)
+    if raw[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        raise InvalidInput(f"{path}: is UTF-16 text: save it as 'CSV UTF-8'")
+    text = raw.decode("utf-8-sig", errors="replace")
     lines = [line for line in text.splitlines()[:50] if line.strip()]
     if not lines:
         return None

@@ -10,8 +10,10 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
+from pipeline.beginning.writing import begin_campaign
 from pipeline.campaign import read_campaign
 from pipeline.cli import app
+from robcal.errors import InvalidInput
 from robcal.files.robot_file import read_robot
 from robcal.robot.export.urdf import urdf_text
 from tests.pipeline.conftest import edit_rows
@@ -83,3 +85,9 @@ def test_folders_without_anything(tmp_path: Path) -> None:
     assert done.exit_code == 1
     assert "neither images nor measurements" in done.stderr
     assert sorted(p.name for p in tmp_path.iterdir()) == ["broken.yaml", "notes.txt"]
+
+
+def test_tables_in_utf_16_are_named(tmp_path: Path) -> None:
+    (tmp_path / "frames.csv").write_text("pose,x_mm,y_mm,z_mm\np1,1,2,3\n", encoding="utf-16")
+    with pytest.raises(InvalidInput, match="not understood: frames.csv"):
+        begin_campaign(tmp_path)

@@ -78,3 +78,20 @@ def test_contradictions_are_told_with_the_file(changes, words, tmp_path):
         generate_poses(config, tmp_path / "poses.csv")
     assert "cell.yaml" in str(problem.value)
     assert not (tmp_path / "poses.csv").exists()
+
+
+def test_a_run_gives_robot_base_and_tool_that_are_not_stated(tmp_path):
+    run = tmp_path / "run"
+    run.mkdir()
+    robot = yaml.safe_load((CONFIGS / "robots" / "kr150_class.yaml").read_text(encoding="utf-8"))
+    robot["world_T_base"] = {"xyz_mm": [10.0, 20.0, 30.0], "rpy_deg": [0, 0, 0]}
+    robot["flange_T_tool"] = {"xyz_mm": [1.0, 2.0, 150.0], "rpy_deg": [0, 0, 0]}
+    (run / "robot_calibrated.yaml").write_text(yaml.safe_dump(robot), encoding="utf-8")
+    body = {"targets": str(CONFIGS / "bodies" / "plate_five_targets.yaml")}
+    config = description(tmp_path, robot="run", world_T_base=None)
+    stated = read_request(config).cell
+    assert np.allclose(stated.world_T_base[:3, 3], [0.01, 0.02, 0.03])
+    assert np.allclose(stated.flange_T_body[:3, 3], [0, 0, 0.15])  # the file's own goes before
+    data = yaml.safe_load(config.read_text(encoding="utf-8"))
+    config.write_text(yaml.safe_dump({**data, "body": body}), encoding="utf-8")
+    assert np.allclose(read_request(config).cell.flange_T_body[:3, 3], [0.001, 0.002, 0.15])
