@@ -28,7 +28,7 @@ from robcal.files.measurement_tables import (
     measurements_of,
     without_frozen,
 )
-from robcal.files.poses_table import Poses, poses_of
+from robcal.files.poses_table import Poses, check_rows, poses_of
 from robcal.files.robot_import import read_any_robot
 from robcal.files.schemas import parse, parse_leniently, proposal
 from robcal.files.tables import FaultyRows, Table, read_table
@@ -198,6 +198,7 @@ class _Reader:
         self.path = path
         self.faults = faults
         self.document = read_yaml(path)
+        self.whole = True
         if faults is None:
             self.entry = parse(self.document, CampaignEntry, FORMAT)
         else:
@@ -205,6 +206,7 @@ class _Reader:
             if entry is None:
                 raise InvalidInput(problems[0], problems)
             self.entry = entry
+            self.whole = not problems
             faults.extend(problems)
         self.notes: list[str] = []
         self.warnings: list[str] = []
@@ -246,9 +248,13 @@ class _Reader:
             self.pose_names = table.columns["pose"]
             return poses_of(table, robot, robot.payloads if robot else ())
 
+        unread = robot is None and self.entry.robot is not None  # its file has faults, told already
+
         def read(table: Table) -> Poses:
             if not self.pose_names and table.has("pose"):
                 self.pose_names = table.columns["pose"]
+            if unread:
+                check_rows(table, self.entry.payloads if self.whole else None)
             return poses_of(table, robot, robot.payloads if robot else ())
 
         return self._rows(use, read)

@@ -96,6 +96,21 @@ def poses_of(table: Table, robot: RobotModel | None, payloads: Collection[str], 
     )
 
 
+def check_rows(table: Table, payloads: Collection[str] | None) -> None:
+    """Look at the rows of poses.csv where the robot is not known; ``payloads`` None: nor which loads there are.
+
+    Raises
+    ------
+    FaultyRows : a joint angle is no number, a load or a set is not known.
+    """
+    for name in table.columns:
+        if re.fullmatch(r"q\d+_(deg|mm)", name):
+            table.numbers(name)
+    _verify(table)
+    if payloads is not None:
+        parse_payload(table, payloads)
+
+
 def _joint_number(heading: str) -> int:
     return int(re.findall(r"\d+", heading)[0])
 

@@ -147,6 +147,7 @@ def parse_leniently(document: YamlDocument, schema: type[E], file_format: str) -
     is left to go on with.
     """
     faults: list[str] = []
+    left_out: set[Place] = set()
     data = copy.deepcopy(document.data)
     found = data.get("format")
     if found != file_format:
@@ -157,10 +158,15 @@ def parse_leniently(document: YamlDocument, schema: type[E], file_format: str) -
             return schema.model_validate(data), faults
         except ValidationError as error:
             problems = _problems(replace(document, data=data), error)
-        new = [text for _, _, text in problems if text not in faults]
-        faults += new
+        faults += [
+            text
+            for problem, place, text in problems
+            if text not in faults
+            and not (problem["type"] == "missing" and (*place, problem["loc"][-1]) in left_out)  # told already
+        ]
+        left_out |= {_entry_of(place) for problem, place, _ in problems if problem["type"] != "unknown_key"}
         mended = [_mend(data, place, problem) for problem, place, _ in problems]
-        if not new or not all(mended):
+        if not all(mended):
             break
     return None, faults
 
@@ -182,6 +188,13 @@ def _inside(data: Any, place: Place) -> Any:
     return functools.reduce(lambda inner, step: inner[step], place, data)
 
 
+def _entry_of(place: Place) -> Place:
+    """The entry with a key of its own that a place belongs to: a list goes as a whole."""
+    while place and isinstance(place[-1], int):
+        place = place[:-1]
+    return place
+
+
 def _mend(data: dict[str, Any], place: Place, problem: ErrorDetails) -> bool:
     """Rename a misspelt key, or leave out the entry of a problem; false where that is not possible."""
     if problem["type"] == "unknown_key":
@@ -191,8 +204,7 @@ def _mend(data: dict[str, Any], place: Place, problem: ErrorDetails) -> bool:
         if meant and meant not in holder:
             holder[meant] = value
         return True
-    while place and isinstance(place[-1], int):
-        place = place[:-1]
+    place = _entry_of(place)
     if not place:
         return False
     _inside(data, place[:-1]).pop(place[-1], None)

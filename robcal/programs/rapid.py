@@ -39,6 +39,8 @@ MOTIONS: Mapping[str, tuple[tuple[int, ...], int]] = {
     "TRIGGC": ((0, 1), 5),
     **dict.fromkeys(("SEARCHL",), ((2,), 4)),
     "SEARCHC": ((2, 3), 5),
+    **dict.fromkeys(("ARCMOVEJ", "ARCMOVEL", "ARCMOVEABSJ"), ((0,), 3)),
+    "ARCMOVEC": ((0, 1), 4),
     **dict.fromkeys(("ARCL", "ARCLSTART", "ARCLEND", "SPOTL", "SPOTJ", "PAINTL", "DISPL"), ((0,), -1)),
     **dict.fromkeys(("ARCC", "ARCCSTART", "ARCCEND", "PAINTC", "DISPC"), ((0, 1), -1)),
 }
@@ -392,6 +394,10 @@ def _motion(reader: _Reader, head: Token, items: Sequence[Token]) -> None:
         reader.names.change(found.text, 0, found.start, f"'{found.text}' is found by a search while the program runs")
 
 
+def _balanced(items: Sequence[Token]) -> bool:
+    return sum((t.kind in "([{") - (t.kind in ")]}") for t in items) == 0
+
+
 def _handed_over(reader: _Reader, items: Sequence[Token]) -> None:
     """Targets that are handed to a routine go where this text does not tell."""
     if _equals(items) < len(items) or len(items) < 2:
@@ -399,6 +405,11 @@ def _handed_over(reader: _Reader, items: Sequence[Token]) -> None:
     if any(t.upper in HARMLESS for t in items if t.kind == "word"):
         return
     for k, token in enumerate(items[1:], 1):
+        if token.kind == "[" and items[k - 1].kind in ("word", ",", "("):
+            stop = next((j for j in range(k + 1, len(items) + 1) if _balanced(items[k:j])), k + 1)
+            if isinstance(_aggregate(reader, items[k:stop]), Written):
+                _refuse(reader, token, f"a target is handed to '{items[k - 1].text}' or the like, which may move there")
+                return
         values = [v for _, v in reader.names.defined.get(token.upper, [])] if token.kind == "word" else []
         alone = items[k - 1].kind in ("word", ",") and (k + 1 == len(items) or items[k + 1].kind in (",", "{", "\\"))
         if alone and any(isinstance(v, Written | Later) for v in values):

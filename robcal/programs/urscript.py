@@ -46,6 +46,12 @@ GUIDED = {
 PRESENT = frozenset({
     "get_actual_joint_positions", "get_target_joint_positions", "get_actual_tcp_pose", "get_target_tcp_pose",
 })  # fmt: skip
+TAKE_POSES = frozenset({
+    "pose_trans", "pose_inv", "pose_add", "pose_sub", "pose_dist", "point_dist", "interpolate_pose", "get_inverse_kin",
+    "get_inverse_kin_has_solution", "get_forward_kin", "is_within_safety_limits", "wrench_trans", "textmsg", "popup",
+    "to_str", "socket_send_string", "assert", "varmsg",
+})  # fmt: skip
+"""Functions of the language that take poses and move nothing."""
 FUNCTIONS = {"d2r": math.radians, "r2d": math.degrees}
 
 
@@ -285,6 +291,8 @@ def _calls(reader: _Reader, items: Sequence[Token]) -> None:
         elif token.text in reader.functions:
             _handed_over(reader, token, arguments)
             reader.blocks.add(Step("call", token.text))
+        elif k == 0 and token.text not in TAKE_POSES:  # a function of another file, whose answer nobody wants
+            _handed_over(reader, token, [a for a in arguments if a and _is_pose(reader, a)])
 
 
 def _move(reader: _Reader, target: Expression, token: Token) -> None:
@@ -306,6 +314,14 @@ def _tool(reader: _Reader, items: Sequence[Token]) -> FrameOf:
         return Stated.of(_constant_frame(reader, items))
     except Refusal as refusal:
         return Unclear(f"cannot be told: {refusal}")
+
+
+def _is_pose(reader: _Reader, argument: Sequence[Token]) -> bool:
+    """Whether an argument is a pose p[...], or the name of one."""
+    argument = _unnamed(argument)
+    named = reader.names.defined.get(argument[0].text, []) if len(argument) == 1 else []
+    values = [v for _, v in named] or [_expression(reader, argument)]
+    return any(isinstance(v, Later) or (isinstance(v, Written) and v.T is not None) for v in values)
 
 
 def _handed_over(reader: _Reader, token: Token, arguments: Sequence[Sequence[Token]]) -> None:

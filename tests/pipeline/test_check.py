@@ -202,3 +202,20 @@ def test_files_that_are_no_campaign(tmp_path: Path, text: str) -> None:
 def test_names_that_windows_takes_for_no_folder(point_campaign: Path, name: str) -> None:
     edit_yaml(point_campaign / "campaign.yaml", lambda d: d.update(name=name))
     assert told(check(point_campaign)[1], "campaign.yaml", "cannot be a folder on Windows")
+
+
+def test_rows_of_poses_are_looked_at_although_the_robot_is_faulty(point_campaign: Path) -> None:
+    robot = point_campaign / "robot.yaml"
+    robot.write_text(robot.read_text(encoding="utf-8").replace("axis: x", "axis: w", 1), encoding="utf-8")
+
+    def spoil(rows: Rows) -> Rows:
+        rows[2]["q2_deg"] = "abc"
+        rows[4]["payload"] = "ghost"
+        return rows
+
+    edit_rows(point_campaign / "poses.csv", spoil)
+    _, errors, _ = check(point_campaign)
+    assert told(errors, "robot.yaml", "'w'"), errors
+    assert told(errors, "poses.csv, row 4", "q2_deg", "abc")
+    assert told(errors, "poses.csv, row 6", "ghost")
+    assert len(errors) == 3, errors  # a wrong entry is not told again as one that is missing

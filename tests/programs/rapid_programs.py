@@ -19,6 +19,12 @@ GOOD: dict[str, str] = {
     MoveC [@F3:a:c@,{C}],[@F5:a:c@,{C}],v100,z1,tGrip\\WObj:=wTable;
 """
     ),
+    "arc_moves": module(
+        f"""    ArcMoveAbsJ [@J0@,[9E9,9E9,9E9,9E9,9E9,9E9]]\\NoEOffs,v1000,z10,tGrip;
+    ArcMoveJ [@F1:a:c@,{C}],v1000,z50,tGrip\\WObj:=wTable;
+    ArcMoveC [@F3:a:c@,{C}],[@F5:a:c@,{C}],v100,z1,tGrip\\WObj:=wTable;
+"""
+    ),
     "named": module(
         """    MoveJ p10,v1000,z50,tGrip\\WObj:=wTable; ! approach p20:=[[1,2,3]]
     MoveL p20,v100,fine,tGrip\\WObj:=wTable;
@@ -111,6 +117,7 @@ ENDMODULE
 }
 
 REFUSED: dict[str, tuple[str, int, str]] = {
+    "literal_handed_over": (module(f"    rPlace [@F0:a:c@,{C}],5;\n"), 5, "handed to 'rPlace'"),
     "variable_offset": (
         module(
             "    MoveL Offs(p10,0,0,nHeight),v100,fine,tGrip\\WObj:=wTable;\n",

@@ -83,6 +83,8 @@ end
 }
 
 REFUSED: dict[str, tuple[str, int, str]] = {
+    "handed_to_another_file": ("set_tcp(p[0,0,0,0,0,0])\nplace_part(p[@F0@], 0.1)\n", 2, "handed to 'place_part'"),
+    "named_handed_over": ("set_tcp(p[0,0,0,0,0,0])\nwp=p[@F0@]\nplace_part(wp)\n", 3, "handed to 'place_part'"),
     "relative": (
         "set_tcp(p[0,0,0,0,0,0])\nmovel(pose_trans(get_actual_tcp_pose(), p[0,0,0.1,0,0,0]))\n",
         2,
