@@ -35,7 +35,9 @@ class Fit:
         state, problem = self.solved.state, self.problem
         data = problem.data
         state = replace(state, twist=np.zeros_like(state.twist) if twist is None else twist)
-        return data.xy - project(state.camera, self.points(state))
+        p_camera = self.points(state)
+        views = problem.views(state, problem.flanges(state)[0])
+        return data.xy - project(state.camera, p_camera) - problem.eccentricity(state.camera, views, p_camera)
 
     def points(self, state: State) -> Array:
         """(m, 3) targets of the marks in the camera."""

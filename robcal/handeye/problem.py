@@ -26,10 +26,22 @@ from robcal.handeye.unknowns import (
     quadratic,
     reduced,
 )
-from robcal.photogrammetry.core.camera import project, project_with_jacobians
+from robcal.photogrammetry.core.bodies import Body
+from robcal.photogrammetry.core.camera import Camera, project, project_with_jacobians
+from robcal.photogrammetry.core.eccentricity import body_normals, centre_shift
 from robcal.transforms import Array, invert, retract, skew, transform
 
 TERMINATION = TerminationSettings(60, 12, 1e-10, 1e-6)
+
+
+def _normals(body: Body) -> Array:
+    """(t, 3) normals of the dots of a body; NaN where there are none."""
+    if body.normals is not None:
+        return body.normals
+    normals = np.full((len(body), 3), np.nan)
+    if np.any(body.diameters > 0):
+        normals[body.known] = body_normals(body.points[body.known])
+    return normals
 
 
 @dataclass(frozen=True)
@@ -41,10 +53,12 @@ class Problem:
     used: BoolArray
     _shape: Array = field(init=False, repr=False)
     _white: Array = field(init=False, repr=False)
+    _normals: Array = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "_shape", directions(self.data.body)[self.data.target])
         object.__setattr__(self, "_white", whitener(self.data.covariance))
+        object.__setattr__(self, "_normals", _normals(self.data.body)[self.data.target])
 
     def flanges(self, state: State) -> tuple[Array, Array | None]:
         """``base_T_flange`` (n, 4, 4) without twists, and twists (n, 6, p) by the robot's deviations if free."""
@@ -62,21 +76,33 @@ class Problem:
         """(m, 3) targets of the marks on the board as it is, deviations of its shape included."""
         return self.data.points + self._shape @ state.shape
 
+    def eccentricity(self, camera: Camera, views: Array, p_camera: Array) -> Array:
+        """(m, 2) px by which perspective and lens move the centres of dots; zero for marks that are none.
+
+        Its dependence on the unknowns is left out of the Jacobians (a dot's image size squared).
+        """
+        n_camera = np.einsum("mij,mj->mi", views[self.data.image, :3, :3], self._normals)
+        return centre_shift(camera, p_camera, n_camera, 0.5 * self.data.body.diameters[self.data.target])
+
     def residuals(self, state: State) -> Array:
         """Whitened residuals (m, 2), as stated; NaN behind the camera."""
         flanges, _ = self.flanges(state)
         data = self.data
-        p_camera = transform(self.views(state, flanges)[data.image], self.drawn(state))
-        return np.einsum("mij,mj->mi", self._white, data.xy - project(state.camera, p_camera))
+        views = self.views(state, flanges)
+        p_camera = transform(views[data.image], self.drawn(state))
+        xy = project(state.camera, p_camera) + self.eccentricity(state.camera, views, p_camera)
+        return np.einsum("mij,mj->mi", self._white, data.xy - xy)
 
     def rows(self, state: State) -> tuple[Array, Array, Array]:
         """Whitened residuals (m, 2), Jacobians (m, 2, a) of the shared unknowns and (m, 2, 6) of the twists."""
         data, layout, image = self.data, self.layout, self.data.image
         flanges, robot = self.flanges(state)
-        T = self.views(state, flanges)[image]
+        views = self.views(state, flanges)
+        T = views[image]
         p_board = self.drawn(state)
         p_camera = transform(T, p_board)
         xy, d_point, d_lens = project_with_jacobians(state.camera, p_camera)
+        xy = xy + self.eccentricity(state.camera, views, p_camera)
         r = np.einsum("mij,mj->mi", self._white, data.xy - xy)
         W, R = self._white, T[:, :3, :3]
         m = len(image)

@@ -99,6 +99,35 @@ def test_camera_and_board_are_found_within_what_is_stated(mounted: str) -> None:
     assert found.heldout.images == 14
 
 
+def dots_in_place_of_corners(seen: Scene, radius: float) -> Scene:
+    """The scene with the centroids of the images of dots (polygons of 90 corners) in place of projected centres."""
+    noise = np.random.default_rng(1).normal(size=seen.xy.shape) * seen.sigma_px
+    angle = np.linspace(0, 2 * np.pi, 90, endpoint=False)
+    rim = radius * np.column_stack([np.cos(angle), np.sin(angle), np.zeros(90)])
+    views = np.array([np.linalg.inv(seen.X) @ np.linalg.inv(F) @ seen.Z for F in seen.actual])[seen.image]
+    p = seen.board[seen.target][:, None] + rim
+    x, y = np.moveaxis(seen.lens.see(np.einsum("mij,mkj->mki", views[:, :3, :3], p) + views[:, None, :3, 3]), -1, 0)
+    x1, y1 = np.roll(x, -1, axis=1), np.roll(y, -1, axis=1)
+    cross = x * y1 - x1 * y
+    centre = [((a + b) * cross).sum(axis=1) / (3 * cross.sum(axis=1)) for a, b in ((x, x1), (y, y1))]
+    return replace(seen, xy=np.column_stack(centre) + noise)
+
+
+def test_the_centre_of_an_ellipse_is_not_taken_for_the_centre_of_its_dot() -> None:
+    quiet = scene(np.random.default_rng(3), "hand", 14, 0.01)
+    data = data_of(dots_in_place_of_corners(quiet, 0.008))
+    body = replace(data.body, diameters=np.full(len(data.body), 0.016))
+    found = calibrate(replace(data, body=body))
+    error = np.concatenate([difference(quiet.X, found.X), difference(quiet.Z, found.Z)])
+    assert np.sum(error * np.linalg.solve(found.covariance, error)) < 32.9  # chi-square (12), 0.1 %
+    assert found.heldout is not None
+    assert found.heldout.px < 0.03
+    # and without the diameters the marks are far from where they should be
+    plain = calibrate(data)
+    assert plain.heldout is not None
+    assert plain.heldout.px > 5 * found.heldout.px
+
+
 def test_without_start_values_the_camera_is_calibrated_as_well() -> None:
     seen = small(3)
     blank = replace(data_of(seen), camera=Camera.from_size(1280, 960))

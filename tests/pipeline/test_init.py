@@ -89,5 +89,5 @@ def test_folders_without_anything(tmp_path: Path) -> None:
 
 def test_tables_in_utf_16_are_named(tmp_path: Path) -> None:
     (tmp_path / "frames.csv").write_text("pose,x_mm,y_mm,z_mm\np1,1,2,3\n", encoding="utf-16")
-    with pytest.raises(InvalidInput, match="not understood: frames.csv"):
+    with pytest.raises(InvalidInput, match=r"not understood: frames\.csv"):
         begin_campaign(tmp_path)
