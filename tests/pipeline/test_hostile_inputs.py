@@ -357,11 +357,12 @@ def test_relative_paths_from_another_folder(point_campaign: Path, tmp_path: Path
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(["/".join(__file__.split("/")[:-3]), *sys.path])}
     subprocess.run([*program, "-q"], cwd=away, env=environment, check=True, timeout=120)
     name = yaml.safe_load((point_campaign / "campaign.yaml").read_text())["name"]
-    assert (away / "runs" / name / "points.csv").is_file()
+    # beside the campaign, wherever the command was given
+    run = point_campaign.parent / "runs" / name
+    assert (run / "points.csv").is_file()
+    assert not list(away.iterdir())
     # the same run named from elsewhere goes on where it was
-    done = runner.invoke(
-        app, ["run", str(point_campaign / "campaign.yaml"), "--out", str(away / "runs" / name), "--until", "measure"]
-    )
+    done = runner.invoke(app, ["run", str(point_campaign / "campaign.yaml"), "--out", str(run), "--until", "measure"])
     assert "measure: up to date" in done.stderr
 
 

@@ -18,6 +18,7 @@ class Found:
     xy: np.ndarray
     covariance: np.ndarray
     semi_axes: np.ndarray
+    contrast: np.ndarray
     code: np.ndarray
     kind: np.ndarray
     angle: np.ndarray
@@ -34,7 +35,7 @@ def test_a_plate_of_plain_dots() -> None:
         d = image.detections
         assert d is not None
         kind = np.full(len(d.xy), TargetKind.DOT, dtype=np.int8)
-        found = Found(d.xy, d.covariance, d.semi_axes, d.code, kind, d.angle)
+        found = Found(d.xy, d.covariance, d.semi_axes, np.ones(len(d.xy)), d.code, kind, d.angle)
         images.append(SurveyImage(image.name, found))  # type: ignore[arg-type]
     assert needs_geometry(images, targets)
     net = survey_body(images, targets, size=(2400, 1800)).network
