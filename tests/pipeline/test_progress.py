@@ -52,13 +52,18 @@ def test_programs_get_the_warnings_of_the_terminal(point_campaign: Path, tmp_pat
     assert line.removeprefix("warning: ") in json.loads(done.stdout)["warnings"]
 
 
+def _heed_ctrl_c() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 @pytest.mark.skipif(os.name == "nt", reason="signals of another system")
 def test_ctrl_c_ends_at_once_and_the_same_command_goes_on(frame_campaign: Path, tmp_path: Path) -> None:
     text = (frame_campaign / "campaign.yaml").read_text().replace("enabled: false", "enabled: true")
     (frame_campaign / "campaign.yaml").write_text(text)
     out = tmp_path / "run"
     command = [sys.executable, "-m", "pipeline", "run", str(frame_campaign), "--out", str(out), "--workers", "1"]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    # a shell that runs the tests in the background has them ignore the signal, and what they start inherits that
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, preexec_fn=_heed_ctrl_c)
     record = out / "state" / "identify.json"
     end = time.monotonic() + 120
     # the diagnosis, which takes seconds, follows
