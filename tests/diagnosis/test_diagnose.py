@@ -91,6 +91,7 @@ def test_extended_model_predicts_better_where_nobody_measured(tmp_path: Path) ->
     assert np.isfinite([v for t in diagnosis.model.terms for v in t.parameters.values()]).all()
 
 
+@pytest.mark.slow
 def test_what_is_fitted_anyway_is_told_as_fitted_last(tmp_path: Path) -> None:
     diagnosis, _ = run(tmp_path, 8033, "stiffness_nonlinear", snr=20.0)
     found = next(f for f in diagnosis.findings if f.cause.name == "stiffness_nonlinear")
@@ -121,6 +122,7 @@ def test_torque_that_acts_through_a_compliance_is_told_for_the_compliance_of_the
     assert np.allclose(spread, 4.0 * np.eye(2) + 0.01 * np.outer(values, values))
 
 
+@pytest.mark.slow
 def test_shares_of_a_mixture_add_up(tmp_path: Path) -> None:
     diagnosis, _ = run(tmp_path, 118, "zero_jump", "gear_ripple", snr=20.0)
     shares = [finding.explained for finding in diagnosis.findings]

@@ -188,6 +188,7 @@ def test_tables_that_cannot_be_meant(
     assert len(told) < 600
 
 
+@pytest.mark.slow
 def test_a_million_rows(point_campaign: Path, tmp_path: Path) -> None:
     row = "p001,9,1,2,3\n"
     (point_campaign / "points.csv").write_text("pose,target,x_mm,y_mm,z_mm\n" + row * 1_000_000)

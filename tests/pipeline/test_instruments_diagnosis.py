@@ -49,6 +49,7 @@ def test_a_scale_is_listed_as_not_to_be_told(sagging: Path) -> None:
     assert "scale of wire 'wire' cannot be told" in sentence
 
 
+@pytest.mark.slow
 def test_what_one_instrument_shows_and_another_contradicts_belongs_to_it(tmp_path: Path) -> None:
     lag = Effect("hysteresis", "axis1", None, {"width_deg": 0.06})
     trackers = {"sound": Watcher(poses="identify"), "odd": Watcher(poses="identify")}

@@ -153,6 +153,7 @@ def pose_of(body, camera, detections, truth):
     return retract(fit.camera_T_body, [0.001, -0.001, 0.002, 0.001, 0.001, -0.001])
 
 
+@pytest.mark.slow
 def test_second_round_finds_what_the_rough_cameras_missed():
     rng = np.random.default_rng(7)
     s = simulate(poses=8)
