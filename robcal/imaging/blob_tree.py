@@ -15,7 +15,6 @@ from robcal.jit import compiled, inner
 _MEMBER, _NEAR = -1, -2  # pixels of the part below the level; those within two pixels of one above it
 # reasons by number, see segmentation
 FOUND, CONTRAST, TOO_LARGE, TOO_SMALL, ELONGATED, SHAPE, BORDER = -1, 0, 1, 2, 3, 4, 5
-REASONS = 6
 _ROUGH_PIXELS = 40_000  # pixels of a part's box that are enough to estimate its noise
 _AROUND = 4  # px from the middle of the smallest parts to what is taken for their background
 _MANY = 8  # parts of a node from which it pays to examine the smallest together

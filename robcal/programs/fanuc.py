@@ -192,9 +192,7 @@ def _stated_frames(source: Source, sections: _Sections) -> dict[str, FrameOf]:
     elements: dict[str, dict[int, float | None]] = {}
     frames: dict[str, FrameOf] = {}
     for _, body in _statements(source, sections):
-        element = re.match(
-            rf"\s*PR\[\s*(\d+)\s*,\s*(\d)\s*(?::[^\]]*)?\]\s*=\s*\(?\s*([+-]?\s*{NUMBER})?\s*\)?\s*$", body
-        )
+        element = _ELEMENT.match(body)
         if element is not None and element[3] is not None:
             own = elements.setdefault(element[1], {})
             own[int(element[2])] = float(re.sub(r"\s", "", element[3])) if int(element[2]) not in own else None

@@ -30,13 +30,12 @@ _MORE_TRIPLES = 1
 
 @dataclass(frozen=True)
 class Found:
-    """One numbering of an image: ``rows`` of the dots, ``targets`` rows of the body, pose, cost and accidents."""
+    """One numbering of an image: ``rows`` of the dots, ``targets`` rows of the body, pose and cost."""
 
     rows: IntArray
     targets: IntArray
     camera_T_body: Array
     cost: float
-    expected_accidents: float
 
 
 def search_body(
@@ -210,7 +209,7 @@ def _verify(
         # three matches are spent on the pose; a triple has two solutions in the mean
         accidents = 2.0 * tried * float(stats.binom.sf(len(rows) - 4, n - 3, chance))
         if accidents < _CHANCE:
-            found.append(Found(rows, own, poses[k], float(cost[k]), accidents))
+            found.append(Found(rows, own, poses[k], float(cost[k])))
         else:
             why = f"{len(rows)} of {n} targets fit, which {accidents:.2g} accidental arrangements would do as well"
     return found, why

@@ -121,12 +121,11 @@ class Prior:
 
 @dataclass(frozen=True)
 class Adjusted:
-    """Solution of the adjustment: unknowns, linearised model, sum of squares of marks and of priors, how it ended."""
+    """Solution of the adjustment: unknowns, linearised model, sum of squares of marks, how it ended."""
 
     unknowns: Unknowns
     design: StationDesign
     cost: float
-    prior_cost: float
     summary: SolveSummary
 
 
@@ -368,7 +367,7 @@ def adjust_station(  # noqa: PLR0913 - options by keyword
         system.coupling,
     )
     mark_cost = float(np.sum(clean.residual**2))
-    return Adjusted(end.unknowns, design, mark_cost, _prior_terms(end.unknowns, prior)[2], summary)
+    return Adjusted(end.unknowns, design, mark_cost, summary)
 
 
 def covariance_blocks(design: StationDesign, marks: MarkTable, e: int, c: int) -> tuple[Array, Array]:
