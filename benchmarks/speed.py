@@ -137,7 +137,7 @@ def detection_table(trees: dict[str, Path], images: Sequence[Path], rounds: int)
 _ORIENT = """
 import sys, time
 from pathlib import Path
-from pipeline.campaign import read_campaign
+from pipeline.campaign_reader import read_campaign
 from pipeline.runs import Run
 from pipeline.stages import orient
 from pipeline.stages.base import Context

@@ -4,7 +4,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from pipeline.campaign import read_campaign
+from pipeline.campaign_reader import read_campaign
 from pipeline.json_io import read_json
 from pipeline.messages import LOG
 from pipeline.runner import Done, run_campaign

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pipeline.campaign import Campaign, all_sources, read_campaign
+from pipeline.campaign import Campaign, all_sources
+from pipeline.campaign_reader import read_campaign
 from pipeline.runner import STAGE_NAMES, default_folder, keep_inputs_apart, processes, stage_key
 from pipeline.runs import Run
 from pipeline.stages.base import Context, Stage

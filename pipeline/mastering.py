@@ -8,7 +8,8 @@ import numpy as np
 
 from pipeline.artifacts import CALIBRATED, MARKS, ORIENTATION
 from pipeline.bodies import body_for_robot
-from pipeline.campaign import Campaign, read_campaign
+from pipeline.campaign import Campaign
+from pipeline.campaign_reader import read_campaign
 from pipeline.json_io import write_json
 from pipeline.runner import run_campaign
 from pipeline.runs import Run, StageRecord, open_run

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pipeline.campaign import Campaign, all_sources, read_campaign
+from pipeline.campaign import Campaign, all_sources
+from pipeline.campaign_reader import read_campaign
 from pipeline.codec import StaleCache
 from pipeline.json_io import fingerprint, read_json, write_json
 from pipeline.messages import LOG, logged_to, working

@@ -76,7 +76,7 @@ def _frames(path: Path) -> Array:
 def library(folder: Path, tables: Mapping[str, Path]) -> Answer:
     """In this process: campaign reader, identification and diagnosis, without stages and reports."""
     from pipeline.bodies import body_for_robot
-    from pipeline.campaign import read_campaign
+    from pipeline.campaign_reader import read_campaign
     from pipeline.runs import Run
     from pipeline.stages.identify import options_of, require_robot
     from pipeline.stages.observations import build_recording

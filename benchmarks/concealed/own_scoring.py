@@ -161,7 +161,7 @@ def true_T_surveyed(truth: OwnTruth, surveyed: Path) -> Array:
 def _fitted(folder: Path, run: Any) -> Any:
     """The identified robot fitted once more beside the errors of its station, without any further physics."""
     from pipeline.artifacts import IDENTIFICATION, ORIENTATION, POINTS, body_for_robot
-    from pipeline.campaign import read_campaign
+    from pipeline.campaign_reader import read_campaign
     from pipeline.stages.identify import require_robot
     from robcal.calibration.calibrated import with_folded_cell
     from robcal.diagnosis.core.fitting import fit

@@ -4,7 +4,8 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.campaign import Campaign, read_leniently
+from pipeline.campaign import Campaign
+from pipeline.campaign_reader import read_leniently
 from pipeline.checking.images import look_into_images
 from pipeline.checking.joints import joint_doubts
 from pipeline.checking.measured import measured_doubts, recording_faults

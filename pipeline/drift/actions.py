@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import sqlalchemy as sa
 
-from pipeline.campaign import read_campaign
+from pipeline.campaign_reader import read_campaign
 from pipeline.drift import store
 from pipeline.drift.database import ALARMS, FILES, META, METADATA, MODELS, READINGS, TOURS, transaction
 from pipeline.drift.readings_table import ReadingsTable, read_readings

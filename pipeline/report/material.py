@@ -7,7 +7,8 @@ from typing import Any, TypeVar
 
 from pipeline import artifacts
 from pipeline.artifacts import Artifact
-from pipeline.campaign import Campaign, read_campaign
+from pipeline.campaign import Campaign
+from pipeline.campaign_reader import read_campaign
 from pipeline.codec import StaleCache
 from pipeline.detected_images import DetectionIndex
 from pipeline.json_io import read_json

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from pipeline.campaign import read_campaign
+from pipeline.campaign_reader import read_campaign
 from pipeline.checking.joints import joint_doubts
 from pipeline.checking.measured import measured_doubts
 from pipeline.cli import app

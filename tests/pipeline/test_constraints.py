@@ -13,7 +13,7 @@ from fixtures.campaigns import write_table, write_yaml
 from fixtures.rigid import frame_from_six
 from fixtures.touching import touching
 from fixtures.true_robot import Circumstances, TrueRobot
-from pipeline.campaign import read_campaign
+from pipeline.campaign_reader import read_campaign
 from pipeline.prediction import predict_run
 from pipeline.runner import run_campaign
 from robcal.errors import InvalidInput

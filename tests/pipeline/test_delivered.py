@@ -9,7 +9,7 @@ import pytest
 
 from fixtures.campaigns import make_campaign
 from pipeline.artifacts import IDENTIFICATION
-from pipeline.campaign import read_campaign
+from pipeline.campaign_reader import read_campaign
 from pipeline.prediction import predict_run
 from pipeline.runner import run_campaign
 from pipeline.runs import open_run

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import yaml
 
-from pipeline.campaign import read_campaign
+from pipeline.campaign_reader import read_campaign
 from robcal.errors import InvalidInput
 from robcal.files.camera_file import read_camera
 from robcal.files.robot_import import read_any_robot

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pipeline.campaign import read_campaign
+from pipeline.campaign_reader import read_campaign
 from robcal.errors import InvalidInput
 from robcal.files.joint_logs import read_controller_log, standstills
 from tests.pipeline.conftest import edit_yaml

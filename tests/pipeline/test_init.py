@@ -11,7 +11,7 @@ import yaml
 from typer.testing import CliRunner
 
 from pipeline.beginning.writing import begin_campaign
-from pipeline.campaign import read_campaign
+from pipeline.campaign_reader import read_campaign
 from pipeline.cli import app
 from robcal.errors import InvalidInput
 from robcal.files.robot_file import read_robot

@@ -12,7 +12,7 @@ import pytest
 from fixtures.effects import Effect
 from fixtures.instruments import Watcher, placement, watch, write_watched
 from fixtures.plan import Plan
-from pipeline.campaign import read_campaign
+from pipeline.campaign_reader import read_campaign
 from pipeline.prediction import predict_run
 from pipeline.runner import run_campaign
 from robcal.errors import InvalidInput

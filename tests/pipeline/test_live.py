@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from fixtures.live_simulator import LiveSimulator, seen
-from pipeline.campaign import read_campaign
+from pipeline.campaign_reader import read_campaign
 from pipeline.cli import app
 from pipeline.live.link import NoAnswer, Pace
 from pipeline.live.session import measure_live

@@ -14,7 +14,7 @@ from fixtures.own_files import make_own
 from fixtures.own_station import OwnPlan, kept_out_frames
 from fixtures.signature import tip_error_mm
 from pipeline.artifacts import IDENTIFICATION, ORIENTATION
-from pipeline.campaign import read_campaign
+from pipeline.campaign_reader import read_campaign
 from pipeline.runner import run_campaign
 from pipeline.runs import Run
 from pipeline.stages.identify import load_calibrated

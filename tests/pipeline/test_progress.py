@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from pipeline.campaign import read_campaign
+from pipeline.campaign_reader import read_campaign
 from pipeline.cli import app
 from pipeline.messages import LOG, show, track, working
 from pipeline.runner import default_folder

@@ -13,7 +13,7 @@ from fixtures.campaigns import write_table, write_yaml
 from fixtures.rigid import frame_from_six, inverse, six_from_frame
 from fixtures.triangulation import TriangulationSensor
 from fixtures.true_robot import Circumstances, TrueRobot
-from pipeline.campaign import read_campaign
+from pipeline.campaign_reader import read_campaign
 from pipeline.pose_generation import generate_poses
 from pipeline.runner import run_campaign
 from robcal.calibration.instruments.cell_frame import FIXED, FREE

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pipeline.adjusted_images import findings_of
-from pipeline.campaign import read_campaign
+from pipeline.campaign_reader import read_campaign
 from pipeline.runs import Run
 from robcal.diagnosis.images.diagnosis import ImageFinding
 from robcal.diagnosis.images.lens_findings import beyond_lenses, station_findings, survey_findings
