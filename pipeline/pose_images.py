@@ -47,7 +47,7 @@ def match_poses(
     if source.marks is not None:
         faults = [
             f"{source.marks.path}: image '{image}' is not a pose of {poses.path.name} (mark "
-            f"{source.marks.image.index(image) + 1}): for a station camera the image is the pose id"
+            f"{source.marks.image.index(image) + 1}): the image of a camera that measures poses is the pose id"
             for image in dict.fromkeys(source.marks.image)
             if image not in known
         ]

@@ -109,8 +109,8 @@ def _start(data: HandEyeData, single: SingleImages, kept_out: BoolArray) -> Star
     if better < 0.2 * wrong:
         raise InvalidInput(f"{told}, but with 'mounted: {turned}' by {better:.1f} px: state that")
     raise InvalidInput(
-        f"{told}: do the images belong to these poses, do the joint angles belong to this robot file, is the size of "
-        "the board's squares right?"
+        f"{told}: do the images belong to these poses, do the joint angles belong to this robot file, are the "
+        "board's kind, columns, rows and sizes right?"
     )
 
 

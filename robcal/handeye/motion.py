@@ -71,14 +71,14 @@ def check_motion(
         raise NotIdentifiable(
             f"the flange never turns (by {np.degrees(size[0]):.1f} degrees at most), it only shifts: the place of the "
             f"{sees} at the flange cannot be told: add poses that turn the flange by 30 degrees or more about two "
-            "directions"
+            f"directions{_perhaps_radians(q)}"
         )
     if size[1] < LEAST_TURN:
         a = _direction(axes)
         raise NotIdentifiable(
             f"all poses turn the flange about one direction only ({a[0]:.2f}, {a[1]:.2f}, {a[2]:.2f} in flange "
             f"coordinates{_still(model, q)}): a shift of the {sees} along it cannot be told: add poses that turn the "
-            f"flange by 30 degrees or more {_across(a)}"
+            f"flange by 30 degrees or more {_across(a)}{_perhaps_radians(q)}"
         )
 
 
@@ -112,3 +112,10 @@ def _still(model: RobotModel | None, q: Array | None) -> str:
         return ""
     moving = [f.name for f, spread in zip(model.joints, np.ptp(q, axis=0), strict=True) if spread > 1e-3]
     return f"; joints that move: {', '.join(moving)}" if moving else ""
+
+
+def _perhaps_radians(q: Array | None) -> str:
+    """A doubt where several joints move, but none is ever further from zero than half a turn in radians would be."""
+    if q is None or not q.size or np.degrees(np.abs(q).max()) > np.pi or np.sum(np.ptp(q, axis=0) > 1e-3) < 3:
+        return ""
+    return f" (no joint angle is beyond {np.degrees(np.abs(q).max()):.2f} degrees: are they in radians?)"
