@@ -122,7 +122,9 @@ def _measurement(noise: Mapping[str, Any]) -> str:
     source, value = _SOURCES.get(str(noise.get("source"))), noise.get("measurement_mm")
     if source is None or value is None:
         return ""
-    return f" The measurement alone scatters by {number(float(value))} mm (RMS; {source})."
+    return (
+        f" The measurement alone scatters by {number(float(value))} mm (RMS over the identification poses; {source})."
+    )
 
 
 def _taken_out(material: Material, v: Verification) -> str:
@@ -163,7 +165,7 @@ def _keys(material: Material, v: Verification, noise: dict[str, float], gain: fl
     if np.isfinite(gain):
         keys.append(KeyFigure(f"{gain:.1f}", "times", "Improvement", f"over {v.poses} poses"))
     if "0" in noise:
-        keys.append(KeyFigure(number(noise["0"] * 1e3), "mm", "Noise of the measurement", "RMS of a measured pose"))
+        keys.append(KeyFigure(number(noise["0"] * 1e3), "mm", "Noise of the measurement", "RMS at the poses kept out"))
     if v.iso is not None:
         keys.append(
             KeyFigure(

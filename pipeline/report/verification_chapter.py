@@ -42,7 +42,7 @@ def noise_by_tool(material: Material) -> dict[str, float]:
 
 
 def error_table(verification: Verification, noise: Mapping[str, float], *, full: bool) -> Table:
-    """Errors before and after by tool; `full` with extremes and spread, as in Table 5.1 of the thesis."""
+    """Errors before and after by tool; `full` with extremes and spread."""
     mm = 1000.0
     rows: list[list[object]] = []
     for name, after in verification.tools.items():
