@@ -27,6 +27,8 @@ from robcal.transforms import Array
 ROBUST = Limits(2.0, 3.5)
 CRITICAL = 4.0
 """Normalised residual from which on a mark is a gross error."""
+ROBUST_FACTOR = 2.0
+"""The limit on squared residuals is this many times wider where gross errors still pull at the solution."""
 ROUNDS, STEPS = 20, 30
 NEGLIGIBLE = 1e-3
 """Half the sum of squares (of whitened residuals) that is no reason for another step."""
@@ -172,12 +174,9 @@ def _tested(
     limit = float(stats.chi2.isf(2 * stats.norm.sf(CRITICAL), 2))
     for _ in range(ROUNDS):
         found = solution.cofactors()
-        moved = _worst_pose(solution, found)
-        problem, state = solution.problem, solution.here.state
-        if moved is not None:
-            loose.append(int(rows[moved]))
-            problem, state = _freed(problem, state, moved)
-        out = _worst_marks(solution, found, limit)
+        problem, state, limits = solution.problem, solution.here.state, solution.limits
+        out = _worst_marks(solution, found, limit if limits is None else ROBUST_FACTOR * limit)
+        moved = None if out.any() else _worst_pose(solution, found)  # single marks may make a pose look as if moved
         if out.any():
             table = problem.marks.select(out)
             ids = orientation.body.ids[table.target]
@@ -185,10 +184,13 @@ def _tested(
             columns = zip(table.camera, rows[table.pose], ids, strict=True)
             rejected += [RejectedMark(orientation.names[c], int(p), int(t), why) for c, p, t in columns]
             problem = problem.without_marks(out)
-        elif moved is None and solution.limits is None:
+        elif moved is not None:
+            loose.append(int(rows[moved]))
+            problem, state = _freed(problem, state, moved)
+        elif limits is None:
             break
-        # once nothing contradicts the robust solution beyond doubt, least squares
-        limits = solution.limits if moved is not None else None
+        else:
+            limits = None
         start = problem.at(state, limits, solution.here)
         solution = _settled(_solve(problem, start, limits), robust=limits is not None, rounds=3)
     return _settled(solution, robust=False), rejected, loose
