@@ -42,6 +42,9 @@ def work(context: Context) -> Outcome:
     placed = run.find(artifacts.PLACED) if diagnosed else None
     delivered = run.find(artifacts.DELIVERED) if diagnosed else None
     options = options_of(campaign, identification.recording.stated)
+    adjusted = run.find(artifacts.ADJUSTED)
+    if adjusted is not None:  # the frames, too, are those of the cameras as adjusted
+        identification, delivered = adjusted.identification, None
     instruments = instruments_in_force(run)
     if instruments is not None:
         identification = leading_identification(instruments)
@@ -130,6 +133,6 @@ STAGE = Stage(
     work=work,
     inputs=no_files,
     settings=lambda campaign: [campaign.name, campaign.entry.model_dump(include={"model"})],
-    after=("identify", "diagnose"),
+    after=("identify", "diagnose", "adjust"),
     module=__name__,
 )
