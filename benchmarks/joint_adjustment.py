@@ -72,7 +72,8 @@ def both(folder: Path, plan: Record) -> tuple[OwnTruth, Identification, JointAdj
     run, log = open_run(folder / "run"), read_campaign(folder / "campaign").poses
     assert log is not None
     found = run.load(IDENTIFICATION)
-    return truth, found, adjust_jointly(run.load(ORIENTATION), run.load(MARKS), found.robot, log, found.rows), seconds
+    joint = adjust_jointly(run.load(ORIENTATION), run.load(MARKS), found.robot, log, np.flatnonzero(~log.verify))
+    return truth, found, joint, seconds
 
 
 def score(robot: CalibratedRobot, truth: OwnTruth) -> Record:

@@ -57,7 +57,7 @@ def adjust_robot(
     InvalidInput : no mark of a pose to identify from is left.
     DegenerateGeometry : no pose carries a frame.
     """
-    found = adjust_jointly(orientation, marks, robot, log, identification.rows)
+    found = adjust_jointly(orientation, marks, robot, log, np.flatnonzero(~log.verify))
     points = measure_points(found.orientation, marks)
     frames = measure_frames(points, found.orientation.body, tolerance=tolerance)
     detailed = FrameObservations(frames.pose, frames.world_T_body, frames.covariance)

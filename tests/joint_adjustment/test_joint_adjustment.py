@@ -11,22 +11,21 @@ import pytest
 
 from fixtures.own_files import make_own
 from fixtures.own_station import OwnTruth, kept_out_frames
+from pipeline.artifacts import IDENTIFICATION, MARKS, ORIENTATION
 from pipeline.campaign_reader import read_campaign
+from pipeline.json_io import read_json
+from pipeline.runner import run_campaign
+from pipeline.stages.identify import load_calibrated
 from robcal.calibration.calibrated import CalibratedRobot
-from robcal.calibration.identification import IdentifiedRobot, IdentifyOptions, identify
+from robcal.calibration.identification import IdentifiedRobot
 from robcal.calibration.joint_log import JointLog
-from robcal.calibration.measurements import Rows, frame_observations
+from robcal.calibration.measurements import Rows
 from robcal.errors import InvalidInput
-from robcal.files.body_file import body_from_file
 from robcal.joint_adjustment.adjustment import JointAdjustment, adjust_jointly
 from robcal.joint_adjustment.assembly import assemble
-from robcal.photogrammetry.measure.frames import measure_frames
-from robcal.photogrammetry.measure.points import measure_points
 from robcal.photogrammetry.station.network import StationMarks, StationOrientation
-from robcal.photogrammetry.station.orientation import orient_station
-from robcal.recipe.station import marks_of_table
-from robcal.robot.kernel import Kernel
 from robcal.transforms import difference
+from tests.pipeline.conftest import edit_yaml
 
 
 @dataclass(frozen=True)
@@ -45,32 +44,12 @@ class Campaign:
         return adjust_jointly(now.orientation, now.marks, now.staged, now.log, now.rows)
 
 
-def recorded(folder: Path, **plan: object) -> Campaign:
-    """A campaign of files, oriented and identified in stages."""
-    truth = make_own(folder, **plan)  # type: ignore[arg-type]
-    campaign = read_campaign(folder)
-    log, robot = campaign.poses, campaign.robot
-    assert log is not None
-    assert robot is not None
-    body = body_from_file("plate", campaign.bodies["plate"].file)
-    place = {name: k for k, name in enumerate(log.names)}
-    tables = {name: source.marks for name, source in campaign.cameras.items()}
-    marks = {name: marks_of_table(table, body, place) for name, table in tables.items() if table is not None}
-    start = {name: source.start.camera for name, source in campaign.cameras.items() if source.start is not None}
-    orientation = orient_station(marks, body, start, {})
-    frames = measure_frames(points := measure_points(orientation, marks), orientation.body)
-    rows = np.flatnonzero(~log.verify)
-    observed = frame_observations(points, frames).subset(rows)
-    kernel = Kernel(robot)
-    staged = identify(robot, log.inputs(kernel).subset(rows), [observed], IdentifyOptions(), kernel)
-    return Campaign(truth, log, marks, orientation, staged, rows)
-
-
 @pytest.fixture(scope="module")
-def campaign(tmp_path_factory: pytest.TempPathFactory) -> Campaign:
-    """A small arm before two cameras, a tenth of the marks hidden, single targets in some images."""
-    return recorded(
-        tmp_path_factory.mktemp("joint") / "campaign",
+def folder(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, OwnTruth]:
+    """A small arm before two cameras, a tenth of the marks hidden, single targets in some images; the truth."""
+    folder = tmp_path_factory.mktemp("joint")
+    truth = make_own(
+        folder / "campaign",
         seed=4,
         robot="ur10",
         poses=30,
@@ -80,6 +59,19 @@ def campaign(tmp_path_factory: pytest.TempPathFactory) -> Campaign:
         alone=0.1,
         joint_repeatability_rad=2e-5,
     )
+    settings = {"diagnosis": {"enabled": False}, "model": {"adjustment": "joint"}}
+    edit_yaml(folder / "campaign" / "campaign.yaml", lambda d: d.update(settings))
+    return folder, truth
+
+
+@pytest.fixture(scope="module")
+def campaign(folder: tuple[Path, OwnTruth]) -> Campaign:
+    """The campaign oriented and identified in stages."""
+    place, truth = folder
+    run = run_campaign(place / "campaign", place / "run", until="identify").run
+    log, staged = read_campaign(place / "campaign").poses, run.load(IDENTIFICATION)
+    assert log is not None
+    return Campaign(truth, log, run.load(MARKS), run.load(ORIENTATION), staged.robot, np.flatnonzero(~log.verify))
 
 
 @pytest.fixture(scope="module")
@@ -130,6 +122,18 @@ def test_second_derivatives_against_differences_of_the_right_side(campaign: Camp
         assert np.allclose(unit * (back.b - there.b) / 2, unit * expected, atol=2e-3 * np.abs(unit * expected).max())
         expected = np.einsum("nai,a->ni", normals.G, step) + np.einsum("nij,nj->ni", normals.V, scatter)
         assert np.allclose((back.s - there.s) / 2, expected, atol=2e-3 * np.abs(expected).max())
+
+
+def test_the_stage_delivers_the_robot_that_the_library_finds(
+    folder: tuple[Path, OwnTruth], campaign: Campaign, found: JointAdjustment
+) -> None:
+    done = run_campaign(folder[0] / "campaign", folder[0] / "run", until="adjust")
+    assert done.ran == ("adjust",)
+    section = read_json(done.run.result)["adjustment"]
+    assert (section["kind"], section["poses"], section["marks"]) == ("joint", 30, found.marks)
+    assert "adjusted jointly" in " ".join(done.result["notes"])
+    assert np.allclose(load_calibrated(done.run).covariance, found.robot.covariance, rtol=1e-6, atol=0.0)
+    assert (folder[0] / "run" / "cameras" / "joint" / "left.yaml").is_file()
 
 
 def _pixels(lin) -> np.ndarray:  # type: ignore[no-untyped-def]

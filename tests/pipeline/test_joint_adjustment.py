@@ -20,6 +20,7 @@ from robcal.errors import InvalidInput
 from tests.pipeline.conftest import edit_yaml
 
 
+@pytest.mark.slow
 def test_joint_adjustment_of_a_run_and_back(tmp_path: Path) -> None:
     campaign, out = tmp_path / "campaign", tmp_path / "run"
     truth = make_own(campaign, seed=4, robot="ur10", poses=26, verify=6, kept_out=40, joint_repeatability_rad=2e-5)
