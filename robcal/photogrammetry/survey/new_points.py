@@ -198,7 +198,7 @@ def _fit_point(
         residual = np.linalg.norm(r.reshape(-1, 2), axis=1)
         if residual.max() < gate:
             sigma = max(float(np.sqrt(np.mean(residual**2))), float(np.median(sightings.sigma[rows])), 0.02)
-            return X, sigma**2 * np.linalg.inv(N), rows
+            return X, np.asarray(sigma**2 * np.linalg.inv(N)), rows
         rows = np.delete(rows, int(np.argmax(residual)))
     return None
 
