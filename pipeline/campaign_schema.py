@@ -231,6 +231,7 @@ class CampaignEntry(Entry):
     station: StationEntry | None = None
     hand_eye: HandEyeEntry | None = None
     quality: QualityEntry = QualityEntry()
+    tolerance_mm: Positive | None = None
     measurements: Tables = Field(default_factory=list)
     body: Text | None = None
     instruments: dict[Annotated[str, BeforeValidator(_instrument_name)], InstrumentEntry] = Field(default_factory=dict)
