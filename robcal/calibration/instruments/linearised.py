@@ -21,8 +21,7 @@ class LinearInstruments:
 
     Attributes
     ----------
-    names, values : (p,) parameters and how far each is from where nothing is wrong (SI); worlds and tools without a
-        prior count as zero.
+    names, values : (p,) parameters and their values (SI); of worlds and tools how far they are from what is given.
     residual, jacobian : (n, D) and (n, D, p), whitened, by stop of the robot and instrument; zero where padded.
     plain, plain_jacobian : the same in the units of the measurements (m, rad).
     spatial : (n, D) which of these are positions or lengths. pose : (n,) rows of the joint log.
@@ -83,7 +82,7 @@ def linearised(
     rows, width = problem.linearise(state), len(problem.prior)
     return LinearInstruments(
         names,
-        evaluator.deviations(state)[columns],
+        np.where(_of_wires(names), state.theta[columns], evaluator.deviations(state)[columns]),
         residual,
         jacobian,
         plain,
@@ -93,6 +92,10 @@ def linearised(
         rows[1][len(rows[1]) - width :],
         rows[0][len(rows[0]) - width :],
     )
+
+
+def _of_wires(names: tuple[str, ...]) -> Array:
+    return np.array([".wire." in n for n in names], dtype=bool)
 
 
 def _spatial(evaluator: JointEvaluator) -> Array:
