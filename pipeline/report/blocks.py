@@ -102,7 +102,10 @@ class Chapter:
 
 @dataclass(frozen=True)
 class Verdict:
-    """The top of the report: how good, how it is known, what to load; `diagnosis` says what is missing."""
+    """The top of the report: how good, how it is known, what to load.
+
+    `diagnosis` says what is missing, `enough` whether a tolerance is kept.
+    """
 
     grade: Grade
     word: str
@@ -112,6 +115,7 @@ class Verdict:
     diagnosis: str = ""
     figures: tuple[KeyFigure, ...] = field(default=())
     table: Table | None = None
+    enough: str = ""
 
 
 def table(

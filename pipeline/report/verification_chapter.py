@@ -87,7 +87,7 @@ def verification_chapter(material: Material) -> Chapter:
         names = [material.pose_name(int(r)) for r in rows]
         noise = noise_by_tool(material)
         blocks += [error_table(verification, noise, full=True)]
-        blocks += [_bars(verification, names), _histogram(verification)]
+        blocks += [_bars(verification, names, tolerance_mm(material)), _histogram(verification)]
         blocks += [_iso(verification)] if verification.iso is not None else []
         blocks += [_calibration_of_uncertainty(verification, names), Text(_honesty(verification))]
     return Chapter("verification", "Pose errors before and after", _lead(material), tuple(blocks))
@@ -109,7 +109,13 @@ def _lead(material: Material) -> str:
     )
 
 
-def _bars(v: Verification, names: list[str]) -> Figure:
+def tolerance_mm(material: Material) -> float | None:
+    """The tolerance that the run was judged by."""
+    told = (material.result.get("verdict") or {}).get("tolerance")
+    return None if told is None else float(told["tolerance_mm"])
+
+
+def _bars(v: Verification, names: list[str], tolerance: float | None) -> Figure:
     errors = v.errors["0"] * 1000
     order = [label(n) for n in names]
     data = []
@@ -140,8 +146,10 @@ def _bars(v: Verification, names: list[str]) -> Figure:
             bargap=0.25,
             xaxis={"type": "category", "nticks": 30},
             updatemenus=[menu],
+            shapes=[] if tolerance is None else [level_line("y", tolerance)],
         ),
-        "Error at the tool's origin, pose by pose.",
+        "Error at the tool's origin, pose by pose."
+        + ("" if tolerance is None else f" Dashed: tolerance, {number(tolerance)} mm."),
         "Bars: error of each pose before and after calibration",
     )
 
