@@ -1,6 +1,7 @@
 """Stage verify: the calibrated robot on poses that took no part, and the files that hand it on."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -8,13 +9,14 @@ from pipeline import artifacts
 from pipeline.codec import save_arrays
 from pipeline.instrument_results import instruments_result
 from pipeline.json_io import read_json
-from pipeline.result_sections import noise_section, verification_section
+from pipeline.result_sections import noise_section, verdict_section, verification_section
 from pipeline.runs import Run
 from pipeline.stages.base import Context, Outcome, Stage, no_files
 from pipeline.stages.identify import instruments_in_force, load_calibrated, options_of, require_robot
 from robcal.calibration.calibrated import CalibratedRobot
 from robcal.calibration.instruments import IdentifiedInstruments
 from robcal.calibration.measurements import RobotObservations
+from robcal.calibration.tolerance import conformity
 from robcal.calibration.verdict import verdict
 from robcal.calibration.verification import Verification
 from robcal.errors import InvalidInput, located
@@ -23,6 +25,7 @@ from robcal.files.residual_table import residual_columns
 from robcal.files.robot_file import write_robot
 from robcal.files.tables import write_table
 from robcal.recipe.agreement import disagreements
+from robcal.recipe.identification import Identification
 from robcal.recipe.instruments import leading_identification, telling_verification, verify_instruments
 from robcal.recipe.noise import noise_of
 from robcal.recipe.verdict import robot_facts
@@ -36,15 +39,11 @@ def work(context: Context) -> Outcome:
     """Verify on the kept-out poses, or by folds where there are none; write the calibrated robot."""
     campaign, run = context.campaign, context.run
     robot, poses = require_robot(campaign)
-    identification = run.load(artifacts.IDENTIFICATION)
+    identification, delivered = _before(run)
     calibrated = load_calibrated(run)
     diagnosed = run.record("diagnose") is not None
     placed = run.find(artifacts.PLACED) if diagnosed else None
-    delivered = run.find(artifacts.DELIVERED) if diagnosed else None
     options = options_of(campaign, identification.recording.stated)
-    adjusted = run.find(artifacts.ADJUSTED)
-    if adjusted is not None:  # the frames, too, are those of the cameras as adjusted
-        identification, delivered = adjusted.identification, None
     instruments = instruments_in_force(run)
     if instruments is not None:
         identification = leading_identification(instruments)
@@ -78,14 +77,26 @@ def work(context: Context) -> Outcome:
     recording = identification.recording
     wrong = [] if instruments is not None else disagreements(found, calibrated, poses, recording, diagnosis)
     doubts = doubtful_coordinates(run)
-    judged = verdict(robot_facts(identification, calibrated, poses, found.delivered, diagnosis, doubts, wrong))
-    told = {"grade": judged.grade, "text": judged.text, "reasons": list(judged.reasons)}
     noise = noise_of(identification, calibrated, poses)
+    facts = robot_facts(identification, calibrated, poses, found.delivered, diagnosis, doubts, wrong)
+    wanted = campaign.entry.tolerance_mm
+    if wanted is not None:
+        facts = replace(facts, conformity=conformity(found.delivered.errors["0"], wanted / 1e3, noise.along))
+    judged = verdict(facts)
+    told = verdict_section(judged, facts.conformity)
     result = {"verification": verification_section(found), "noise": noise_section(noise), "verdict": told}
     if instruments is not None:
         sections = {name: verification_section(RobotVerification(v, None, v.rows)) for name, v in verified.items()}
         result["instruments"] = instruments_result(instruments, sections)
     return Outcome(result, outputs, [*notes, *noise.notes])
+
+
+def _before(run: Run) -> tuple[Identification, RobotVerification | None]:
+    """What the robot is verified against, and its verification where a diagnosis has made it already."""
+    adjusted = run.find(artifacts.ADJUSTED)
+    if adjusted is not None:  # the frames, too, are those of the cameras as adjusted
+        return adjusted.identification, None
+    return run.load(artifacts.IDENTIFICATION), run.find(artifacts.DELIVERED)
 
 
 def doubtful_coordinates(run: Run) -> list[str]:
@@ -132,7 +143,7 @@ STAGE = Stage(
     applies=lambda campaign: campaign.robot is not None and campaign.poses is not None and campaign.measures_robot,
     work=work,
     inputs=no_files,
-    settings=lambda campaign: [campaign.name, campaign.entry.model_dump(include={"model"})],
+    settings=lambda campaign: [campaign.name, campaign.entry.model_dump(include={"model", "tolerance_mm"})],
     after=("identify", "diagnose", "adjust"),
     module=__name__,
 )

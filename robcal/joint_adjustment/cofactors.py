@@ -4,7 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from robcal.joint_adjustment.problem import JointAt, JointProblem, Limits, factor
+from robcal.estimation.schur import Factor
+from robcal.joint_adjustment.problem import JointAt, JointProblem, Limits
 from robcal.photogrammetry.station.adjustment import mark_redundancy
 from robcal.transforms import Array
 
@@ -30,8 +31,8 @@ class Cofactors:
 def cofactors(problem: JointProblem, here: JointAt, limits: Limits | None) -> Cofactors:
     """Covariances at a solution, of weighted observations where there are ``limits``."""
     normals = problem.normals(here, limits)
-    found = factor(normals)
-    Q = found.cofactors(np.zeros((0, 0)))
+    found = Factor(normals)
+    Q = found.cofactors()
     own, mixed = found.station_cofactors(Q)  # (n, 6, 6), (a + p, n, 6)
     a = len(Q) - len(problem.columns)
     J, R = here.by_robot, np.where(problem.tied[:, None, None], problem.root, np.eye(6))

@@ -155,10 +155,10 @@ class JointProblem:
         free = station_normals(without_nan(here.lin), self.marks, here.state.station, self.prior, weights)
         on, p = np.flatnonzero(self.active), len(self.columns)
         J, R = here.by_robot, np.where(self.tied[:, None, None], self.root, np.eye(6))
-        C, V, s = free.coupling[on].transpose(1, 0, 2), free.pose_matrix, free.pose_right
+        C, V, s = free.G[:, on], free.V, free.s
         a = len(on)
         A = np.empty((a + p, a + p))
-        A[:a, :a] = free.matrix[np.ix_(on, on)]
+        A[:a, :a] = free.A[np.ix_(on, on)]
         A[:a, a:] = np.einsum("nai,nip->ap", C, J, optimize=True)
         A[a:, :a] = A[:a, a:].T
         VJ = V @ J
@@ -166,7 +166,7 @@ class JointProblem:
         G = np.concatenate([C, np.swapaxes(VJ, 1, 2)], axis=1) @ R
         weight = self.scatter_weights(here.state, limits)
         own = np.swapaxes(R, 1, 2) @ V @ R + weight[:, None, None] * np.eye(6)
-        b = np.concatenate([free.right[on], np.einsum("nip,ni->p", J, s)])
+        b = np.concatenate([free.b[on], np.einsum("nip,ni->p", J, s)])
         right = np.einsum("nij,ni->nj", R, s) - weight[:, None] * here.state.scatter
         return Normals(A, G, own, b, right)
 
@@ -186,17 +186,11 @@ class JointProblem:
         normals = self.normals(here, limits)
 
         def propose(damping: float) -> tuple[JointAt, float]:
-            step, scatter = factor(normals, damping).solve(normals.b, normals.s)
+            step, scatter = Factor(normals, damping=damping).solve(normals.b, normals.s)
             saved = 0.5 * float(step @ normals.b + np.sum(scatter * normals.s))
             return self.at(self.moved(here.state, step, scatter), limits), saved
 
         return Linearised(here.half_cost, propose, lambda trial: trial.half_cost)
-
-
-def factor(normals: Normals, damping: float = 0.0) -> Factor:
-    """Factor of normal equations without constraints."""
-    a = len(normals.A)
-    return Factor(normals, np.zeros((a, 0)), np.zeros(a, dtype=bool), damping)
 
 
 def scatter_root(kernel: Kernel, robot: State, inputs: PoseInputs, joint_sigma: Array) -> Array:
