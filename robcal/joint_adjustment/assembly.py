@@ -12,7 +12,6 @@ from robcal.calibration.problem import State, folded
 from robcal.errors import InvalidInput
 from robcal.joint_adjustment.problem import JointProblem, JointState, scatter_root
 from robcal.photogrammetry.station.network import MarkTable, StationMarks, StationOrientation, Unknowns
-from robcal.transforms import Array
 
 START_SIGMA = 1e-4
 """Scatter of a joint (rad, m) to start from: so wide that marks alone place each pose at first."""
@@ -83,7 +82,7 @@ def _active(orientation: StationOrientation, table: MarkTable) -> NDArray[np.boo
 
 def mark_table(
     orientation: StationOrientation, marks: Mapping[str, StationMarks], tied: Rows
-) -> tuple[MarkTable, Array]:
+) -> tuple[MarkTable, Rows]:
     """The marks that the station was oriented with and those of images that carry no pose by themselves.
 
     Also the pose number (m,) of each. What the station rejected stays out; poses that neither it nor the robot places
