@@ -69,10 +69,9 @@ def chapters(report: Path) -> None:
                 break
             tab.wait_for_timeout(1000)
         tab.screenshot(path=IMAGES / "tutorial_verdict.png")
+        tab.set_viewport_size({"width": 1000, "height": 1000})
         for name in ("verification", "network"):
-            tab.evaluate("name => document.getElementById(name).scrollIntoView()", name)
-            tab.wait_for_timeout(1500)
-            tab.screenshot(path=IMAGES / f"tutorial_{name}.png")
+            tab.locator(f"#{name}").screenshot(path=IMAGES / f"tutorial_{name}.png")
         browser.close()
 
 

@@ -38,4 +38,3 @@ def test_examples_of_the_library_run(tmp_path: Path, monkeypatch: pytest.MonkeyP
     for block in blocks:
         exec(block, names)
     assert names["error"].max() < 1e-4
-
