@@ -9,8 +9,9 @@ import numpy as np
 
 from robcal.calibration.identifiability import repetitions
 from robcal.calibration.observations import DistanceObservations, FrameObservations, PointObservations
-from robcal.diagnosis.core.fitting import Accepted, Fit, damping, solve
+from robcal.diagnosis.core.fitting import Accepted, Fit, damping
 from robcal.diagnosis.core.recording import Recording, observation_data
+from robcal.estimation.minimum_norm import solve
 from robcal.physics.cause import Array, ObservationCause
 from robcal.transforms import invert, transform
 
@@ -63,10 +64,15 @@ def folds(recording: Recording, count: int = FOLDS) -> Array:
 
     Repetitions of one another lie in the fold of the first of them, whenever they were driven.
     """
-    order = np.argsort(np.argsort(recording.covariates["index"]))
+    return block_labels(recording.covariates["index"], recording.q, count)
+
+
+def block_labels(index: Array, q: Array, count: int = FOLDS) -> Array:
+    """The same of poses (n, joints) that were driven in the order of ``index`` (n,)."""
+    order = np.argsort(np.argsort(index, kind="stable"), kind="stable")
     blocks = min(2 * count, len(order))
     labels = (order * blocks // len(order)) % count
-    same = repetitions(recording.q)
+    same = repetitions(q)
     first = np.full(int(same.max(initial=-1)) + 1, len(order))
     np.minimum.at(first, same, order)
     return np.asarray(labels[np.argsort(order)][first[same]])
