@@ -191,7 +191,9 @@ def run_one(source: Path, name: str, seed: int, folder: Path) -> list[object]:
     train = {row["pose"] for row in split.poses if row.get("set") != "verify"}
     kept_out = {row["pose"] for row in split.poses} - train
     noise = float(result["noise"]["measurement_mm"] or 0.0) / np.sqrt(3.0)
-    seen = [_figures(split.measured, frames, train, test, noise) for test in (kept_out, {r["pose"] for r in split.unseen})]
+    seen = [
+        _figures(split.measured, frames, train, test, noise) for test in (kept_out, {r["pose"] for r in split.unseen})
+    ]
     told = result["verification"]
     headline, said, grade = told["delivered"]["rms"], told.get("coverage_95"), result["verdict"]["grade"]
     causes = [c["cause"] for c in result.get("diagnosis", {}).get("causes", [])]
@@ -239,7 +241,9 @@ def main() -> None:
         root = (given.keep or Path(scratch)).resolve()
         for campaign in given.campaigns:
             for name in given.variants:
-                rows.append(run_one(campaign.resolve(), name, given.seed, root / campaign.name / name.replace(" ", "_")))
+                rows.append(
+                    run_one(campaign.resolve(), name, given.seed, root / campaign.name / name.replace(" ", "_"))
+                )
                 print(*rows[-1], sep=" | ", flush=True)
     columns = ["kept out", "counted", "headline", "found", "covered", "unseen", "covered", "said", "grade", "causes"]
     table("Real recordings, divided anew (mm RMS, shares)", ["recording", "variant", *columns, "contradiction"], rows)

@@ -70,6 +70,7 @@ def test_results_that_contradict_one_another_are_told(tmp_path: Path) -> None:
     late = replace(robot, model=robot.model.with_terms((*robot.model.terms, lag)))
     guessed = replace(poses, inferred=(0,))
     freed = verify_robot(robot.model, identification, late, guessed, freed=identification.recording)
-    assert freed.recorded is not None and freed.unstated is not None
+    assert freed.recorded is not None
+    assert freed.unstated is not None
     assert freed.delivered.coverage_95 == freed.unstated.coverage_95 != freed.recorded.coverage_95
     assert freed.delivered.normalised == pytest.approx(freed.unstated.normalised)
