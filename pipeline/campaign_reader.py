@@ -22,6 +22,7 @@ from robcal.files.flange_poses import read_flange_poses
 from robcal.files.foreign_tables import read_mapped_table
 from robcal.files.images import list_images
 from robcal.files.joint_logs import is_joint_log, log_of_robot, read_controller_log
+from robcal.files.line_cameras import measured_lights, read_line_cameras
 from robcal.files.measurement_tables import MeasuredTable, check_marks, marks_of, measurements_of, without_frozen
 from robcal.files.poses_table import Poses, check_rows, poses_of
 from robcal.files.robot_import import read_any_robot
@@ -198,17 +199,23 @@ class _Reader:
         if robot is not None and poses is not None and sound and poses.q.shape[1]:
             places = forward(chain_of(robot), poses.q)[:, :3, 3]
 
-        def read(table: Table) -> MeasuredTable:
-            found = measurements_of(table, known if sound else self.pose_names)
+        def read(use: TableUse, table: Table) -> MeasuredTable:
+            found = self._measurements(use, table, known if sound else self.pose_names)
             found = found if places is None else without_frozen(found, places, known)
             self._check_targets(table, found, bodies)
             return found
 
-        found = [self._part(partial(self._rows, use, read)) for use in uses]
+        found = [self._part(partial(self._rows, use, partial(read, use))) for use in uses]
         tables = tuple(table for table in found if table is not None)
         for table in tables:
             self.warnings.extend(table.notes)
         return tables
+
+    def _measurements(self, use: TableUse, table: Table, names: Sequence[str]) -> MeasuredTable:
+        if use.line_cameras is None:
+            return measurements_of(table, names)
+        path = self._file(use.line_cameras)
+        return replace(measured_lights(table, names, read_line_cameras(path)), sources=(path,))
 
     def _instruments(
         self,

@@ -166,7 +166,7 @@ class RobotUse(Entry):
 
 
 class TableUse(Entry):
-    """A table, and how to read one of another program."""
+    """A table, and how to read one of another program; ``line_cameras``: the system whose readings it holds."""
 
     file: Text
     columns: dict[Text, Text] = Field(default_factory=dict)
@@ -175,10 +175,11 @@ class TableUse(Entry):
     skip_rows: Annotated[int, Field(ge=0, le=100_000)] = 0
     header: bool = True
     orientation: Orientation = "rpy"
+    line_cameras: Text | None = None
 
     def table_map(self) -> TableMap | None:
         """How to read the table; None where it is one of the project's own."""
-        given = self.model_dump(exclude={"file"}, exclude_defaults=True)
+        given = self.model_dump(exclude={"file", "line_cameras"}, exclude_defaults=True)
         return TableMap(**given) if given else None
 
 
@@ -230,6 +231,7 @@ class CampaignEntry(Entry):
     station: StationEntry | None = None
     hand_eye: HandEyeEntry | None = None
     quality: QualityEntry = QualityEntry()
+    tolerance_mm: Positive | None = None
     measurements: Tables = Field(default_factory=list)
     body: Text | None = None
     instruments: dict[Annotated[str, BeforeValidator(_instrument_name)], InstrumentEntry] = Field(default_factory=dict)

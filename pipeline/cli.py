@@ -23,6 +23,7 @@ from pipeline.command_line import (
 )
 from pipeline.drift_commands import app as drift_app
 from pipeline.fleet_commands import history, many
+from pipeline.line_camera_commands import lines
 from pipeline.live_commands import live_app
 from pipeline.mastering_commands import mastering
 from pipeline.messages import LOG, keep_libraries_silent
@@ -40,6 +41,7 @@ app.add_typer(drift_app, name="drift")
 app.add_typer(mastering)
 app.add_typer(programs)
 app.add_typer(many)
+app.add_typer(lines, name="lines")
 app.add_typer(live_app)
 app.add_typer(history, name="history")
 
@@ -261,14 +263,19 @@ def compensate(
 
 
 @app.command()
-def report(run_folder: RunFolder, quiet: Quiet = False, as_json: Json = False) -> None:
+def report(
+    run_folder: RunFolder,
+    pdf: Annotated[bool, typer.Option("--pdf", help="Print it to report.pdf as well (needs Chromium).")] = False,
+    quiet: Quiet = False,
+    as_json: Json = False,
+) -> None:
     """Write the report again."""
     with answers("report", as_json, quiet) as answer:
         from pipeline.commands import report_again
 
-        path = report_again(run_folder)
-        answer["report"] = str(path)
-        LOG.info(str(path))
+        for kind, path in report_again(run_folder, pdf=pdf).items():
+            answer[kind] = str(path)
+            LOG.info(str(path))
 
 
 @app.command(short_help="Render a small campaign and run it.")

@@ -42,7 +42,11 @@ def diagnose_several(context: Context, settings: SelectionSettings) -> Outcome:
         )
         outputs.append(run.save(DIAGNOSED_INSTRUMENTS, replace(done.found, notes=(*done.found.notes, *done.notes))))
     told = [_attributed(t, done.found.placed) for t in done.told]
-    content = instruments_content(done.own, told, leading, gain, done.not_told) | {"in_force": bool(told)}
+    decided: dict[str, object] = {"in_force": done.in_force}
+    if done.decided is not None:
+        errors = {"identified": 1e3 * done.decided.identified, "diagnosed": 1e3 * done.decided.diagnosed_error}
+        decided |= {"in_force_reason": done.decided.reason, "delivered_mm": errors}
+    content = instruments_content(done.own, told, leading, gain, done.not_told) | decided
     write_json(run.diagnosis, content)
     statements = [t.statement for t in done.told] or ["nothing missing: the model explains the data"]
     causes = [
@@ -50,7 +54,7 @@ def diagnose_several(context: Context, settings: SelectionSettings) -> Outcome:
         | {"instrument": t.instrument}
         for t in done.told
     ]
-    result = {key: content[key] for key in ("mismatch", "p_value", "heldout_mm", "in_force", "not_told")}
+    result = {key: content[key] for key in ("mismatch", "p_value", "heldout_mm", "not_told")} | decided
     return Outcome({"diagnosis": result | {"causes": causes}}, outputs, [*statements, *done.not_told, *done.notes])
 
 

@@ -6,6 +6,8 @@ from typing import Any
 import numpy as np
 
 from robcal.calibration.noise_parts import NoiseParts
+from robcal.calibration.tolerance import Conformity
+from robcal.calibration.verdict import Verdict
 from robcal.calibration.verification import ErrorStatistics
 from robcal.photogrammetry.station.network import StationMarks, StationOrientation
 from robcal.photogrammetry.survey.types import SurveyResult
@@ -110,6 +112,25 @@ def verification_section(found: RobotVerification) -> dict[str, Any]:
             "groups": outcome.iso.groups,
         }
     return result
+
+
+def verdict_section(judged: Verdict, kept: Conformity | None) -> dict[str, Any]:
+    """Section `verdict`; `tolerance` where the campaign states one."""
+    told: dict[str, Any] = {"grade": judged.grade, "text": judged.text, "reasons": list(judged.reasons)}
+    if kept is not None:
+        told["tolerance"] = {
+            "tolerance_mm": kept.tolerance * 1000,
+            "kept": kept.kept,
+            "places": kept.places,
+            "within": kept.within,
+            "beyond": kept.beyond,
+            "undecided": kept.undecided,
+            "largest_mm": kept.largest * 1000,
+            "uncertainty_mm": kept.uncertainty * 1000,
+            "share_kept_95": kept.share,
+            "statement": kept.statement,
+        }
+    return told
 
 
 def noise_section(noise: NoiseParts) -> dict[str, Any]:

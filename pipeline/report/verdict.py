@@ -106,6 +106,27 @@ def _robot(material: Material, v: Verification) -> Verdict:
         diagnosis_sentence(material),
         _keys(material, v, noise, gain),
         error_table(v, noise, full=False),
+        _enough(told.get("tolerance")),
+    )
+
+
+def _enough(kept: Mapping[str, Any] | None) -> str:
+    """The user's tolerance against the kept-out errors, in words."""
+    if kept is None:
+        return "State tolerance_mm in campaign.yaml, and the errors are judged by it here."
+    answer = "Yes" if kept["kept"] else "No"
+    if kept["undecided"]:
+        answer = "Perhaps" if kept["kept"] else "Not surely" if not kept["beyond"] else answer
+    text = f"{answer}: {kept['statement']}."
+    if kept["uncertainty_mm"] > 0:
+        text += (
+            f" An error within {number(kept['uncertainty_mm'], 2)} mm of the tolerance is too close to tell, as the "
+            "measurement errs by that much itself (ISO 14253-1, 95 %)."
+        )
+    return text + (
+        f" Of further poses drawn like these at least {percent(kept['share_kept_95'])} keep it (95 % sure)."
+        if kept["share_kept_95"] > 0
+        else ""
     )
 
 

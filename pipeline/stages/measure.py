@@ -1,6 +1,10 @@
 """Stage measure: targets in the world, by forward intersection or from the tables of another system."""
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
+from scipy.linalg import block_diag
 
 from pipeline.artifacts import MARKS, ORIENTATION, POINTS
 from pipeline.bodies import surveyed_or_given
@@ -8,6 +12,7 @@ from pipeline.campaign import Campaign
 from pipeline.runs import Run
 from pipeline.stages.base import Context, Outcome, Stage
 from robcal.errors import InvalidInput
+from robcal.files.measurement_tables import MeasuredTable, SharedErrors
 from robcal.files.poses_table import Poses
 from robcal.files.tables import write_table
 from robcal.photogrammetry.measure.exchanged import exchanged_back, find_exchanges
@@ -67,11 +72,30 @@ def points_from_tables(campaign: Campaign) -> MeasuredPoints:
         without = tables[stated.index(False)].path
         raise InvalidInput(f"{without}: states no uncertainty while other tables do: add the column sigma_mm")
     covariance = np.concatenate([t.covariance for t in tables if t.covariance is not None]) if all(stated) else None
-    return MeasuredPoints.from_table(
+    points = MeasuredPoints.from_table(
         np.concatenate([t.pose for t in tables]),
         np.concatenate([t.target for t in tables]),
         np.concatenate([t.values for t in tables]),
         covariance,
+    )
+    return _with_shared(points, tables)
+
+
+def _with_shared(points: MeasuredPoints, tables: Sequence[MeasuredTable]) -> MeasuredPoints:
+    """The points with what those of each calibrated system have in common apart from their own noise."""
+    if all(table.shared is None for table in tables) or points.covariance is None:
+        return points
+    shared = [t.shared or SharedErrors.none(t.covariance) for t in tables if t.covariance is not None]
+    widths = np.cumsum([0, *(s.jacobian.shape[2] for s in shared)])
+    jacobian = [
+        np.pad(s.jacobian, ((0, 0), (0, 0), (at, widths[-1] - at - s.jacobian.shape[2])))
+        for s, at in zip(shared, widths, strict=False)
+    ]
+    return replace(
+        points,
+        covariance=np.concatenate([s.noise for s in shared]),
+        station_jacobian=np.concatenate(jacobian),
+        station_covariance=block_diag(*(s.covariance for s in shared if len(s.covariance))),
     )
 
 
@@ -96,7 +120,7 @@ STAGE = Stage(
     applies=applies,
     work=work,
     inputs=lambda campaign: [
-        *(table.path for table in campaign.measured("points")),
+        *(path for table in campaign.measured("points") for path in (table.path, *table.sources)),
         *(body.file.path for body in campaign.bodies.values()),
     ],
     settings=lambda campaign: [

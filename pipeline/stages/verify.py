@@ -1,6 +1,7 @@
 """Stage verify: the calibrated robot on poses that took no part, and the files that hand it on."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -8,13 +9,14 @@ from pipeline import artifacts
 from pipeline.codec import save_arrays
 from pipeline.instrument_results import instruments_result
 from pipeline.json_io import read_json
-from pipeline.result_sections import noise_section, verification_section
+from pipeline.result_sections import noise_section, verdict_section, verification_section
 from pipeline.runs import Run
 from pipeline.stages.base import Context, Outcome, Stage, no_files
 from pipeline.stages.identify import instruments_in_force, load_calibrated, options_of, require_robot
 from robcal.calibration.calibrated import CalibratedRobot
 from robcal.calibration.instruments import IdentifiedInstruments
 from robcal.calibration.measurements import RobotObservations
+from robcal.calibration.tolerance import conformity
 from robcal.calibration.verdict import verdict
 from robcal.calibration.verification import Verification
 from robcal.errors import InvalidInput, located
@@ -75,9 +77,13 @@ def work(context: Context) -> Outcome:
     recording = identification.recording
     wrong = [] if instruments is not None else disagreements(found, calibrated, poses, recording, diagnosis)
     doubts = doubtful_coordinates(run)
-    judged = verdict(robot_facts(identification, calibrated, poses, found.delivered, diagnosis, doubts, wrong))
-    told = {"grade": judged.grade, "text": judged.text, "reasons": list(judged.reasons)}
     noise = noise_of(identification, calibrated, poses)
+    facts = robot_facts(identification, calibrated, poses, found.delivered, diagnosis, doubts, wrong)
+    wanted = campaign.entry.tolerance_mm
+    if wanted is not None:
+        facts = replace(facts, conformity=conformity(found.delivered.errors["0"], wanted / 1e3, noise.along))
+    judged = verdict(facts)
+    told = verdict_section(judged, facts.conformity)
     result = {"verification": verification_section(found), "noise": noise_section(noise), "verdict": told}
     if instruments is not None:
         sections = {name: verification_section(RobotVerification(v, None, v.rows)) for name, v in verified.items()}
@@ -129,7 +135,7 @@ STAGE = Stage(
     applies=lambda campaign: campaign.robot is not None and campaign.poses is not None and campaign.measures_robot,
     work=work,
     inputs=no_files,
-    settings=lambda campaign: [campaign.name, campaign.entry.model_dump(include={"model"})],
+    settings=lambda campaign: [campaign.name, campaign.entry.model_dump(include={"model", "tolerance_mm"})],
     after=("identify", "diagnose"),
     module=__name__,
 )

@@ -48,6 +48,7 @@ class NoiseParts:
     lack_of_fit : what the model misses beyond the repetitions (beyond the measurement where there are none).
     repeats : poses that repeat another one. p_value : of the lack of fit, None without repetitions.
     notes : disagreements, in words.
+    dimensions : of the measured place, three but for distances.
     """
 
     measurement: float
@@ -58,6 +59,12 @@ class NoiseParts:
     repeats: int
     p_value: float | None
     notes: tuple[str, ...] = ()
+    dimensions: int = 3
+
+    @property
+    def along(self) -> float:
+        """Standard deviation of the measurement along a direction, m."""
+        return self.measurement / float(np.sqrt(self.dimensions))
 
 
 @dataclass(frozen=True)
@@ -106,13 +113,13 @@ def noise_parts(
     total = _Scatter(float(np.sum(residuals**2)) / freedom * dimension, freedom)
     if pure is None:
         lack = float(np.sqrt(max(0.0, total.square - measurement**2)))
-        return NoiseParts(measurement, source, told, None, lack, repeats, None, tuple(notes))
+        return NoiseParts(measurement, source, told, None, lack, repeats, None, tuple(notes), dimension)
     square = total.square * total.freedom - pure.square * pure.freedom
     beyond = _Scatter(max(0.0, square) / max(1, total.freedom - pure.freedom), max(1, total.freedom - pure.freedom))
     p = float(stats.f.sf(beyond.square / max(pure.square, 1e-300), beyond.freedom, pure.freedom))
     lack = float(np.sqrt(max(0.0, beyond.square - pure.square))) if p < LEVEL else 0.0
     scatter = float(np.sqrt(max(0.0, pure.square - measurement**2)) / lever) if lever > 0 else None
-    return NoiseParts(measurement, source, told, scatter, lack, repeats, p, tuple(notes))
+    return NoiseParts(measurement, source, told, scatter, lack, repeats, p, tuple(notes), dimension)
 
 
 def _measurement(

@@ -7,6 +7,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
+from robcal.calibration.tolerance import FEW, Conformity
+
 Grade = Literal["good", "care", "bad"]
 
 LARGEST_SIGMA0 = 3.0
@@ -46,6 +48,7 @@ class Facts:
     coverage_95 : share of the kept-out poses inside their 95 % region; kept_out : their number.
     disagreeing : results that contradict one another, in words.
     unexplained : the diagnosis finds structure that no cause explains; unnamed : part of the model has no name.
+    conformity : errors against the user's tolerance, None where there is none.
     """
 
     sigma0: float | None = None
@@ -63,6 +66,7 @@ class Facts:
     disagreeing: Sequence[str] = field(default=())
     unexplained: bool = False
     unnamed: bool = False
+    conformity: Conformity | None = None
 
 
 @dataclass(frozen=True)
@@ -161,7 +165,21 @@ def _kept_out(f: Facts) -> str:
     return f"tested on {f.kept_out} poses only" if f.kept_out else "tested on no pose"
 
 
+def _missed(f: Facts) -> str:
+    return f.conformity.statement if f.conformity is not None and _often(f.conformity) else ""
+
+
+def _close(f: Facts) -> str:
+    c = f.conformity
+    return c.statement if c is not None and not _often(c) and (c.over or c.undecided) else ""
+
+
+def _often(c: Conformity) -> bool:
+    return c.beyond > FEW * c.places
+
+
 RULES: tuple[Rule, ...] = (
+    Rule("tolerance", "bad", _missed),
     Rule("gain", "bad", _gain),
     Rule("mirrored", "bad", _mirror),
     Rule("agreement", "bad", lambda f: "; ".join(f.disagreeing)),
@@ -173,6 +191,7 @@ RULES: tuple[Rule, ...] = (
     Rule("coordinates", "care", _untested),
     Rule("coverage", "care", _coverage),
     Rule("kept out", "care", _kept_out),
+    Rule("tolerance in doubt", "care", _close),
     Rule("unexplained", "care", lambda f: "the diagnosis finds structure that it cannot explain" * f.unexplained),
     Rule("unnamed", "care", lambda f: "part of the correction is an empirical term without a name" * f.unnamed),
 )

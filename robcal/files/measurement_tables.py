@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from robcal.calibration.recording_errors import empty_readings, frozen_readings
 from robcal.errors import InvalidInput
@@ -27,6 +27,36 @@ MOST_OUTSIDE = 0.2
 
 
 @dataclass(frozen=True)
+class SharedErrors:
+    """What points of a system with a calibration of its own have in common.
+
+    Attributes
+    ----------
+    noise : (m, 3, 3) m^2, independent from point to point.
+    jacobian : (m, 3, k) by the system's numbers; covariance : (k, k) of these.
+    """
+
+    noise: Array
+    jacobian: Array
+    covariance: Array
+
+    @classmethod
+    def none(cls, covariance: Array) -> "SharedErrors":
+        """Of points (m, 3, 3) that have nothing in common."""
+        return cls(covariance, np.zeros((len(covariance), 3, 0)), np.zeros((0, 0)))
+
+    def select(self, rows: ArrayLike) -> "SharedErrors":
+        """The given points (indices or mask)."""
+        chosen = np.asarray(rows)
+        return replace(self, noise=self.noise[chosen], jacobian=self.jacobian[chosen])
+
+    @property
+    def total(self) -> Array:
+        """(m, 3, 3) covariance of each point alone."""
+        return np.asarray(self.noise + self.jacobian @ self.covariance @ np.swapaxes(self.jacobian, -1, -2))
+
+
+@dataclass(frozen=True)
 class MeasuredTable:
     """Measurements of one table.
 
@@ -39,6 +69,8 @@ class MeasuredTable:
     covariates : further numeric columns that belong to the single measurement (``cycle``, ``time_s``).
     angles : (m, 3) of frames as they stand in the file, rad.
     loops : kinds of closed loops by name; ``loop`` : (m,) which of them, in that order.
+    shared : what the points have in common, where the system states it; it is part of ``covariance``.
+    sources : further files that the table was made from.
     """
 
     kind: Kind
@@ -53,6 +85,8 @@ class MeasuredTable:
     angles: Array | None = None
     loops: Mapping[str, str] = field(default_factory=dict)
     loop: IntArray | None = None
+    shared: SharedErrors | None = None
+    sources: tuple[Path, ...] = ()
 
     def __len__(self) -> int:
         return len(self.pose)
@@ -73,6 +107,7 @@ class MeasuredTable:
             notes=(*self.notes, note),
             angles=None if self.angles is None else self.angles[kept],
             loop=None if self.loop is None else self.loop[kept],
+            shared=None if self.shared is None else self.shared.select(kept),
         )
 
 
@@ -116,8 +151,8 @@ def measurements_of(table: Table, pose_names: Sequence[str], kind: Kind | None =
     table.require(needed)
     if not len(table):
         raise InvalidInput(f"{path}: lists no measurements")
-    pose, notes = _pose_index(table, pose_names)
-    target = _target_ids(table) if "target" in needed else np.full(len(table), -1, dtype=np.int64)
+    pose, notes = pose_index(table, pose_names)
+    target = target_ids(table) if "target" in needed else np.full(len(table), -1, dtype=np.int64)
     keys = ["pose", *(["target"] if "target" in needed else []), *(["cycle"] if table.has("cycle") else [])]
     table.unique(keys)
     if kind == "distances":
@@ -142,7 +177,7 @@ def _constraints(table: Table, pose_names: Sequence[str]) -> MeasuredTable:
     if not len(table):
         raise InvalidInput(f"{table.path}: lists no constraints")
     number, kinds, values, variance = read_constraints(table)
-    pose, notes = _pose_index(table, pose_names)
+    pose, notes = pose_index(table, pose_names)
     none = np.full(len(table), -1, dtype=np.int64)
     return MeasuredTable(
         "constraints", table.path, pose, table.rows, none, values, variance, {}, tuple(notes), None, kinds, number
@@ -162,7 +197,7 @@ def _without_empty(table: MeasuredTable, pose_names: Sequence[str]) -> MeasuredT
     empty = empty_readings(np.round(numbers, 6))
     if empty.all():
         raise InvalidInput(f"{table.path}: no row holds a reading: all coordinates are zero or a sentinel")
-    told = _few(list(dict.fromkeys(pose_names[i] for i in table.pose[empty])))
+    told = few(list(dict.fromkeys(pose_names[i] for i in table.pose[empty])))
     return table.without(
         empty, f"{table.path.name}: {int(empty.sum())} rows hold no reading (zeros or a sentinel), set aside: {told}"
     )
@@ -179,7 +214,7 @@ def without_frozen(table: MeasuredTable, places: Array, pose_names: Sequence[str
         frozen[rows] = frozen_readings(table.pose[rows], values[rows].reshape(len(rows), -1), places)
     if frozen.all():
         return table
-    told = _few(list(dict.fromkeys(pose_names[i] for i in table.pose[frozen])))
+    told = few(list(dict.fromkeys(pose_names[i] for i in table.pose[frozen])))
     return table.without(
         frozen,
         f"{table.path.name}: {int(frozen.sum())} readings repeat the one before though the robot had moved: set aside "
@@ -188,6 +223,11 @@ def without_frozen(table: MeasuredTable, places: Array, pose_names: Sequence[str
 
 
 def _kind(table: Table) -> Kind:
+    if table.has("u_px"):
+        raise InvalidInput(
+            f"{table.path}: readings of linear cameras need their system: write {{file: {table.path.name}, "
+            "line_cameras: system.yaml} (made by 'pipeline lines calibrate') in place of the file's name"
+        )
     if table.has("constraint"):
         return "constraints"
     if table.has("distance_mm"):
@@ -205,7 +245,8 @@ def _kind(table: Table) -> Kind:
     )
 
 
-def _pose_index(table: Table, pose_names: Sequence[str]) -> tuple[IntArray, list[str]]:
+def pose_index(table: Table, pose_names: Sequence[str]) -> tuple[IntArray, list[str]]:
+    """Rows (m,) of the poses in the table of poses, and a note where some have no measurement."""
     place = {name: i for i, name in enumerate(pose_names)}
     cells = table.texts("pose")
     unknown = [cell not in place for cell in cells]
@@ -219,15 +260,17 @@ def _pose_index(table: Table, pose_names: Sequence[str]) -> tuple[IntArray, list
     missing = [name for name in pose_names if name not in measured]
     notes = []
     if missing:
-        notes.append(f"{len(missing)} poses have no measurement in {table.path.name} ({_few(missing)})")
+        notes.append(f"{len(missing)} poses have no measurement in {table.path.name} ({few(missing)})")
     return np.array([place[cell] for cell in cells], dtype=np.int64), notes
 
 
-def _few(names: Sequence[str]) -> str:
+def few(names: Sequence[str]) -> str:
+    """The first names for a message."""
     return ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
 
 
-def _target_ids(table: Table) -> IntArray:
+def target_ids(table: Table) -> IntArray:
+    """Ids (m,) of a table's targets."""
     cells = table.columns["target"]
     table.refuse(
         [not cell.lstrip("-").isdigit() for cell in cells],
@@ -311,7 +354,7 @@ def marks_of(table: Table, default_sigma: float = 0.1) -> MarksTable:
     if not len(table):
         raise InvalidInput(f"{path}: lists no marks")
     image = table.texts("image")
-    target = _target_ids(table)
+    target = target_ids(table)
     table.unique(["image", "target"])
     xy = np.column_stack([table.numbers("x_px"), table.numbers("y_px")])
     far = np.abs(xy).max(axis=1) > 1e6

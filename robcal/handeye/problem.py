@@ -11,7 +11,7 @@ import numpy as np
 
 from robcal.estimation.grouping import sum_by, whitener
 from robcal.estimation.levenberg import Linearised, levenberg
-from robcal.estimation.schur import Factor, Normals
+from robcal.estimation.schur import Factor
 from robcal.estimation.summary import SolveSummary, TerminationSettings
 from robcal.handeye.data import BoolArray, HandEyeData
 from robcal.handeye.shape import directions
@@ -167,11 +167,11 @@ class Problem:
         """Free deviations (s,) of the board and their covariance, by one step from a solution without them."""
         system = self.system(at.state)
         normals = reduced(system, at.variances)
-        factor = _factor(normals, 0.0)
+        factor = Factor(normals)
         part = self.layout.parts(at.state)[3]
         step, _ = factor.solve(normals.b, normals.s)
         value = step[part] - system.value[part] + at.state.shape[self.layout.shape]
-        return value, factor.cofactors(np.zeros((0, 0)))[part, part]
+        return value, factor.cofactors()[part, part]
 
     def moved(self, state: State, step: Array, twist: Array) -> State:
         """State after a step (a,) of the shared unknowns, with new twists (n, 6)."""
@@ -213,14 +213,14 @@ class Problem:
 
             def propose(damping: float) -> tuple[State, float]:
                 if damping == 0.0:
-                    step, units = _factor(normals, 0.0).solve(normals.b, normals.s)
+                    step, units = Factor(normals).solve(normals.b, normals.s)
                     trial = self.moved(state, step - system.value, scale * units)
                 else:  # damped about the state itself
                     units0 = np.divide(state.twist, scale, out=np.zeros_like(state.twist), where=scale > 0)
                     b = normals.b - normals.A @ system.value - np.einsum("nai,ni->a", normals.G, units0)
                     s = normals.s - np.einsum("nij,nj->ni", normals.V, units0)
                     s = s - np.einsum("nai,a->ni", normals.G, system.value)
-                    step, units = _factor(normals, damping).solve(b, s)
+                    step, units = Factor(normals, damping=damping).solve(b, s)
                     trial = self.moved(state, step, scale * (units0 + units))
                     step, units = step + system.value, units0 + units
                 predicted = now - quadratic(system, variances, weight, step, units)
@@ -244,12 +244,7 @@ class Solved:
     def covariance(self) -> Array:
         """(a, a) covariance of the shared unknowns."""
         normals = reduced(self.system, self.variances)
-        return _factor(normals, 0.0).cofactors(np.zeros((0, 0)))
-
-
-def _factor(normals: Normals, damping: float) -> Factor:
-    a = len(normals.A)
-    return Factor(normals, np.zeros((a, 0)), np.zeros(a, dtype=bool), damping)
+        return Factor(normals).cofactors()
 
 
 def _short(step: Array) -> Array:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 
@@ -74,6 +75,36 @@ class InForce:
     measuring: str = ""
 
 
+class Delivers(Protocol):
+    """What a fitted robot delivers at poses of other folds."""
+
+    def errors(self, dropped: Sequence[str] = ()) -> tuple[Array, Array]:
+        """Lengths (m_obs,) of the position errors, m, and of the whitened ones, without some amplitudes."""
+        ...
+
+
+class Judge(Protocol):
+    """Forms of a robot compared over folds of the poses; ``of_rows`` : block (m,) of each observation."""
+
+    @property
+    def log(self) -> JointLog:
+        """With approach directions as inferred."""
+        ...
+
+    @property
+    def of_rows(self) -> Array:
+        """Block (m,) of each observation."""
+        ...
+
+    def delivery(self, form: Form, given: JointLog) -> Delivers:
+        """A form predicted from a table of poses."""
+        ...
+
+    def gain(self, before: Form, after: Form, given: JointLog) -> tuple[Gain, Gain]:
+        """What one form gains against another: of plain lengths, and weighted by their uncertainty."""
+        ...
+
+
 @dataclass(frozen=True)
 class Folds:
     """What robots deliver over blocked folds of the identification poses.
@@ -127,7 +158,7 @@ def choose(recording: Recording, log: JointLog, rows: Rows, bare: Form, extended
     chosen, reasons, measuring = _beside_faults(folds, bare, extended.direct)
     waits: dict[str, str] = {}
     if groups := groups_of(bare, extended):
-        chosen, told, waits = _with_terms(folds, chosen, replace(extended, direct=chosen.direct), groups)
+        chosen, told, waits = with_terms(folds, chosen, replace(extended, direct=chosen.direct), groups)
         reasons += told
     whole, _ = folds.gain(bare, chosen, log.as_stated(), freed=False)
     reason = "; ".join(reasons) + ("" if chosen is not bare else "; the identified robot is delivered")
@@ -155,7 +186,7 @@ def _beside_faults(folds: Folds, bare: Form, direct: Sequence[Accepted]) -> tupl
     return beside if beside.direct and found.clear else bare, reasons, "; ".join(why)
 
 
-def _with_terms(folds: Folds, base: Form, full: Form, groups: Groups) -> tuple[Form, list[str], dict[str, str]]:
+def with_terms(folds: Judge, base: Form, full: Form, groups: Groups) -> tuple[Form, list[str], dict[str, str]]:
     """The form with the terms that pay, reasons, and by parameter why the others wait."""
     stated = folds.log.as_stated()
     unpaid = not_paying(folds.delivery(full, stated), groups, folds.of_rows)
@@ -179,7 +210,7 @@ def _with_terms(folds: Folds, base: Form, full: Form, groups: Groups) -> tuple[F
 
 
 def _with_approach(
-    folds: Folds, part: Form, full: Form, groups: Groups, unpaid: Mapping[str, Gain]
+    folds: Judge, part: Form, full: Form, groups: Groups, unpaid: Mapping[str, Gain]
 ) -> tuple[Form, list[str], dict[str, str]]:
     """Terms that pay where the approach directions are known: in force if they cost nothing where they are not stated;
     else they wait, by group why."""
@@ -220,17 +251,17 @@ def groups_of(bare: Form, extended: Form) -> Groups:
     return groups | {name: (name,) for name in extended.free if name not in present | of_terms}
 
 
-def not_paying(full: Delivery, groups: Groups, fold: Array) -> dict[str, Gain]:
+def not_paying(full: Delivers, groups: Groups, fold: Array) -> dict[str, Gain]:
     """Groups that do not pay beside those that stay, and the gain of each: backward, the most useless one first."""
     return _backward(full, groups, fold, lambda plain, weighted: plain.pays_beside(weighted))
 
 
-def contradicted(full: Delivery, groups: Groups, fold: Array) -> dict[str, Gain]:
+def contradicted(full: Delivers, groups: Groups, fold: Array) -> dict[str, Gain]:
     """Groups without which blocked folds are predicted no worse, and the weighted gain of each: backward."""
     return _backward(full, groups, fold, lambda plain, weighted: weighted.after < weighted.before)
 
 
-def _backward(full: Delivery, groups: Groups, fold: Array, stays: Callable[[Gain, Gain], bool]) -> dict[str, Gain]:
+def _backward(full: Delivers, groups: Groups, fold: Array, stays: Callable[[Gain, Gain], bool]) -> dict[str, Gain]:
     left = dict(groups)
     out: dict[str, Gain] = {}
     dropped: tuple[str, ...] = ()

@@ -18,14 +18,13 @@ from robcal.calibration.verification import ErrorStatistics, Verification, fit_n
 from robcal.errors import InvalidInput
 from robcal.recipe.identification import Identification
 from robcal.recipe.verification import FOLDS, RobotVerification
+from robcal.recipe.wire_alarms import wire_alarms
 from robcal.robot.kernel import Kernel
 from robcal.robot.model import RobotModel
 
 CARRIED, TIED = float(np.radians(0.02)), 0.95
 """Points tell a sensor's orientation where its standard deviation is below this (rad) and no angle is correlated more
 than that with the sensor's origin."""
-USUAL_LENGTH, SURE = 2e-4, 2.0
-"""Deviation of a link (m) that is usual; one that is larger by this many standard deviations is told."""
 
 
 def identify_from_instruments(
@@ -54,7 +53,7 @@ def identify_from_instruments(
     instruments, told = with_told_orientations(Kernel(start), log, instruments)
     notes += told
     found = identify_instruments(start, log, instruments, options)
-    found = replace(found, notes=(*found.notes, *length_alarms(found)))
+    found = replace(found, notes=(*found.notes, *wire_alarms(found, log, options)))
     unstated = [i.name for i in instruments if not i.recording.stated]
     if unstated:
         notes.append(f"{' and '.join(unstated)}: no uncertainty is stated, it is estimated from the residuals")
@@ -92,34 +91,6 @@ def with_told_orientations(
                 "flange_T_tool.rpy_deg is held as stated"
             )
     return out, notes
-
-
-def length_alarms(found: IdentifiedInstruments) -> list[str]:
-    """Lengths that links do not have, where a robot was identified from lengths of wires alone.
-
-    Sag, stretch or a wrong scale of a wire fit into the robot with small residuals and make it worse.
-    """
-    identified = [p for p in found.placed.values() if p.robot is not None and not p.instrument.loop]
-    if not identified:
-        return []
-    robot = identified[0].robot
-    if robot is None or any(p.instrument.dimension > 1 for p in identified):
-        return []
-    frames = {f.name for f in robot.model.frames}
-    odd = [
-        f"{name} {1e3 * value:+.2f} +- {1e3 * sigma:.2g} mm"
-        for name, value, sigma in zip(robot.names, robot.theta, robot.sigma, strict=True)
-        if (parts := name.rpartition("."))[0] in frames
-        and parts[2] in ("x", "y", "z")
-        and abs(value) - SURE * sigma > USUAL_LENGTH
-    ]
-    if not odd:
-        return []
-    return [
-        f"identified from wires alone, lengths are off by more than links usually are ({1e3 * USUAL_LENGTH:g} mm): "
-        f"{', '.join(odd)}; a wire that sags, stretches or has a wrong scale or pulley does that with small residuals: "
-        "verify in 6D before driving with this robot"
-    ]
 
 
 def leading_identification(found: IdentifiedInstruments) -> Identification:

@@ -7,7 +7,7 @@ identified anew from all instruments, causes of the robot and parameters of wire
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import stats
@@ -16,9 +16,7 @@ from robcal.calibration.identification import IdentifyOptions
 from robcal.calibration.instruments import IdentifiedInstruments, Instrument, PlacedInstrument, identify_instruments
 from robcal.calibration.instruments.evaluator import kernel_ends
 from robcal.calibration.joint_log import JointLog
-from robcal.calibration.measurements import Rows
-from robcal.calibration.wire import LIMITS
-from robcal.diagnosis.core.fitting import Accepted, fit, terms_of
+from robcal.diagnosis.core.fitting import Accepted, fit
 from robcal.diagnosis.core.recording import Recording
 from robcal.diagnosis.core.result import Diagnosis, Finding
 from robcal.diagnosis.diagnose import diagnose
@@ -27,9 +25,9 @@ from robcal.diagnosis.search.selection import SelectionSettings
 from robcal.errors import RobcalError
 from robcal.physics.cause import ObservationCause
 from robcal.physics.measuring import WIRE_SCALE
+from robcal.recipe.instruments_delivery import Anew, InstrumentsDiagnosis, Told, delivered
 from robcal.recipe.recording import recording_for_diagnosis
-from robcal.recipe.robot_diagnosis import corrected
-from robcal.recipe.wires import Correction, identify_with_corrections
+from robcal.recipe.wires import Correction
 from robcal.robot.kernel_cache import kernel_of
 from robcal.robot.model import RobotModel
 from robcal.transforms import Array
@@ -38,60 +36,8 @@ CONTRADICTS = 1e-3
 """Probability of two instruments' amplitudes below which they contradict each other."""
 SHOWS = 1e-3
 """Probability of no effect below which an instrument shows a cause, or would show it if it were there."""
-CERTAIN = 4.0
-"""Standard deviations by which a wire's parameter must differ from nothing once all are identified together."""
 KNOWN = 1e-4
 """m; a tool whose place is known to this carries the scale of a wire, and so do lengths of links with priors."""
-
-
-@dataclass(frozen=True)
-class Told:
-    """A cause, which instrument shows it, which others do, and which contradict it.
-
-    ``of_instrument`` : it belongs to the instrument, not to the robot.
-    """
-
-    finding: Finding
-    instrument: str
-    agreeing: tuple[str, ...] = ()
-    contradicting: tuple[str, ...] = ()
-
-    @property
-    def of_instrument(self) -> bool:
-        """Whether it belongs to the instrument that shows it."""
-        return isinstance(self.finding.cause, ObservationCause) or bool(self.contradicting)
-
-    @property
-    def statement(self) -> str:
-        """In a sentence."""
-        if self.contradicting:
-            others = " and ".join(f"'{name}'" for name in self.contradicting)
-            return (
-                f"instrument '{self.instrument}' shows what {others} contradicts, so it belongs to that instrument: "
-                f"{self.finding.statement}"
-            )
-        if self.of_instrument:
-            return f"instrument '{self.instrument}': {self.finding.statement}"
-        return self.finding.statement
-
-
-@dataclass(frozen=True)
-class InstrumentsDiagnosis:
-    """What a diagnosis of several instruments leaves behind.
-
-    Attributes
-    ----------
-    own : the diagnosis of each instrument that was identified from. told : all causes, most significant first.
-    found : the robot and all instruments identified anew beside them; the same object where nothing was found.
-    start : the model with the causes of the robot, from which it was identified. not_told : what cannot be told.
-    """
-
-    own: Mapping[str, Diagnosis]
-    told: tuple[Told, ...]
-    found: IdentifiedInstruments = field(repr=False)
-    start: RobotModel = field(repr=False)
-    not_told: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
 
 
 def diagnose_instruments(
@@ -133,17 +79,8 @@ def diagnose_instruments(
         own[name] = diagnose(case.model, case.recording, case.free, case.tied, None, settings or SelectionSettings())
     told = [Told(f, name) for name, d in own.items() for f in d.findings]
     told = _distinct([_compared(t, cases) for t in told])
-    again, start = found, model
-    notes: list[str] = []
-    if told:
-        again, start, notes = _identified_anew(model, found, instruments, log, options, corrections or {}, told, own)
-        needless = [t for t in told if _is_needless(t, again)]
-        if needless:  # the law of a search is linear: what it needed beside the right cause the exact one does not
-            told = [t for t in told if t not in needless]
-            again, start, notes = _identified_anew(
-                model, found, instruments, log, options, corrections or {}, told, own
-            )
-    return InstrumentsDiagnosis(own, tuple(told), again, start, tuple(not_told), tuple(notes))
+    anew = Anew(model, found, instruments, log, options or IdentifyOptions(), corrections or {}, own)
+    return delivered(anew, told, tuple(not_told))
 
 
 @dataclass(frozen=True)
@@ -257,66 +194,3 @@ def _distinct(told: Sequence[Told]) -> list[Told]:
         if t.of_instrument or not same:
             out.append(t)
     return out
-
-
-def _identified_anew(
-    model: RobotModel,
-    found: IdentifiedInstruments,
-    instruments: Sequence[Instrument],
-    log: JointLog,
-    options: IdentifyOptions | None,
-    corrections: Mapping[str, Correction],
-    told: Sequence[Told],
-    own: Mapping[str, Diagnosis],
-) -> tuple[IdentifiedInstruments, RobotModel, list[str]]:
-    """All instruments together once more: the robot's causes as terms, wires' as parameters, others taken back."""
-    options, start = options or IdentifyOptions(), model
-    of_robot = [t.finding for t in told if not t.of_instrument]
-    for number, f in enumerate(of_robot):
-        item = Accepted(f.cause, f.constants, f.values, f.covariance)
-        if f.cause.free_parameters:
-            if not isinstance(options.parameters, str):
-                options = replace(options, parameters=(*options.parameters, *f.cause.free_parameters))
-            continue
-        start = start.with_terms(terms_of(item, number))
-    freed = [_beside(i, [t.finding for t in told if t.instrument == i.name], own.get(i.name), log) for i in instruments]
-    again = identify_with_corrections(start, log, freed, corrections, options)
-    notes = []
-    for name, placed in again.placed.items():
-        before = found.placed[name]
-        back = _returned(before, placed)
-        if len(back):
-            notes.append(
-                f"instrument '{name}': {len(back)} poses that contradicted all others before are used again: "
-                f"{', '.join(log.names[int(k)] for k in back[:5])}{', ...' if len(back) > 5 else ''}"
-            )
-    return again, start, notes
-
-
-def _beside(instrument: Instrument, findings: Sequence[Finding], own: Diagnosis | None, log: JointLog) -> Instrument:
-    """An instrument with parameters of its wire to be identified, or its measurements freed of what was found."""
-    wires = tuple(kind for f in findings if (kind := _wire_parameter(f)))
-    if wires:
-        return replace(instrument, wire=tuple(dict.fromkeys((*instrument.wire, *wires))))
-    clean = None if own is None else corrected(instrument.recording, log, own)
-    return instrument if clean is None else replace(instrument, recording=clean)
-
-
-def _is_needless(told: Told, found: IdentifiedInstruments) -> bool:
-    """Whether a wire's parameter is not certain once it is identified beside all others."""
-    kind = _wire_parameter(told.finding)
-    value, sigma = found.placed[told.instrument].wire.get(kind, (0.0, 0.0)) if kind else (1.0, 0.0)
-    return (bool(kind) and abs(value) < CERTAIN * sigma) or (bool(kind) and sigma == 0.0)
-
-
-def _wire_parameter(finding: Finding) -> str:
-    """The parameter of a wire that a cause stands for; empty for any other cause."""
-    cause = finding.cause
-    if isinstance(cause, ObservationCause) and cause.stage == "wire" and cause.parameters[0] in LIMITS:
-        return cause.parameters[0]
-    return ""
-
-
-def _returned(before: PlacedInstrument, after: PlacedInstrument) -> Rows:
-    """Rows that were left out before and are used now."""
-    return np.intersect1d(before.rows[~before.used], after.rows[after.used])

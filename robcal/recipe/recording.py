@@ -71,11 +71,9 @@ def common_errors(
 def _of_frames(observations: FrameObservations, rows: Rows, orientation: StationOrientation) -> Array:
     """The share that cameras and body have in the poses of the station's adjustment: exactly its joint covariance.
 
-    With `V` a pose's own normal matrix and `C` its coupling with the unknowns common to all poses, an error `d` of
-    those moves the pose by `-inv(V) C' d`. Weakness: poses that the adjustment did not use count as free of it.
+    Weakness: poses that the adjustment did not use count as free of it.
     """
-    design = orientation.design
-    moved = -np.einsum("pij,gpj->pig", design.pose_inverse, design.coupling) @ _root(design.reduced_inverse)
+    moved = orientation.design.pose_response @ _root(orientation.design.reduced_inverse)
     place = {int(p): i for i, p in enumerate(orientation.poses)}
     at = np.array([place.get(int(rows[p]), -1) for p in observations.pose])
     return np.where(at[:, None, None] >= 0, moved[at], 0.0)

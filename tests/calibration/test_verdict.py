@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 
+from robcal.calibration.tolerance import conformity
 from robcal.calibration.verdict import RULES, Deviation, Facts, verdict
 
 SOUND = Facts(
@@ -29,6 +30,12 @@ BROKEN = {
     "negative": ({"negative": (Deviation("axis2.elastic_pitch", -0.1, "deg/kNm"),)}, "care", "axis2.elastic_pitch"),
     "coordinates": ({"untested": ("target 31 contradicts the survey",)}, "care", "target 31"),
     "coverage": ({"coverage_95": 0.8}, "care", "80 % inside"),
+    "tolerance": ({"conformity": conformity([1e-4, 4e-4, 5e-4], 3e-4)}, "bad", "2 of 3 kept-out errors miss"),
+    "tolerance in doubt": (
+        {"conformity": conformity([1e-4, 2.9e-4], 3e-4, 1e-4)},
+        "care",
+        "1 of them too close to tell",
+    ),
     "kept out": ({"kept_out": 9}, "care", "on 9 poses only"),
     "unexplained": ({"unexplained": True}, "care", "cannot explain"),
     "unnamed": ({"unnamed": True}, "care", "without a name"),

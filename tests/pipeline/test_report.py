@@ -71,7 +71,7 @@ def diagnosed(tmp_path_factory: pytest.TempPathFactory) -> Run:
     """A run with a strong backlash and names meant to break the page."""
     folder = tmp_path_factory.mktemp("report")
     make_campaign(folder / "campaign", seed=101, poses=60, verify=12, effects=["backlash"], snr=15)
-    edit_yaml(folder / "campaign" / "campaign.yaml", lambda d: d.update(name=HOSTILE))
+    edit_yaml(folder / "campaign" / "campaign.yaml", lambda d: d.update(name=HOSTILE, tolerance_mm=0.2))
     for name in ("poses.csv", "points.csv"):
         edit_rows(folder / "campaign" / name, hostile)
     return run_campaign(folder / "campaign", folder / "run", workers=1).run
@@ -110,6 +110,15 @@ def test_the_top_says_what_result_json_says(page: Page, diagnosed: Run) -> None:
     diagnosis = json.loads(diagnosed.diagnosis.read_text())
     assert diagnosis["causes"][0]["cause"] == "backlash"
     assert diagnosis["statement"] in re.sub(r"\s+", " ", page.text)
+
+
+def test_the_verdict_judges_by_the_tolerance(page: Page, diagnosed: Run) -> None:
+    verdict = json.loads(diagnosed.result.read_text())["verdict"]
+    told = verdict["tolerance"]
+    assert told["tolerance_mm"] == pytest.approx(0.2)
+    assert told["kept"] == (told["largest_mm"] <= 0.2)
+    assert told["within"] + told["beyond"] + told["undecided"] == told["places"]
+    assert told["statement"] in re.sub(r"\s+", " ", page.text)
 
 
 def test_chapters_appear_only_where_there_is_data(page: Page) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 from robcal.calibration.identifiability import repetitions
 from robcal.diagnosis.core.fitting import Fit, solve
 from robcal.diagnosis.core.recording import Recording
-from robcal.diagnosis.gain.heldout import folds
+from robcal.diagnosis.gain.heldout import block_labels
 from robcal.physics.cause import Array, ObservationCause
 from robcal.robot.kernel import PoseInputs
 from robcal.robot.model import GEOMETRIC_KINDS
@@ -31,8 +31,13 @@ WAITING = 1.01
 
 def blocked_folds(recording: Recording) -> Array:
     """Fold of each pose (n,): blocks of consecutive poses; repeats of a pose are in the fold of the first of them."""
-    labels = folds(recording)
-    groups = repetitions(recording.q)
+    return blocks_of(recording.covariates["index"], recording.q)
+
+
+def blocks_of(index: Array, q: Array) -> Array:
+    """The same of poses (n, joints) that were driven in the order of ``index`` (n,)."""
+    labels = block_labels(index, q)
+    groups = repetitions(q)
     first = np.unique(groups, return_index=True)[1]
     return np.asarray(labels[first[groups]])
 

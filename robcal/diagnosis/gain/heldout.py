@@ -63,10 +63,15 @@ def folds(recording: Recording, count: int = FOLDS) -> Array:
 
     Repetitions of one another lie in the fold of the first of them, whenever they were driven.
     """
-    order = np.argsort(np.argsort(recording.covariates["index"]))
+    return block_labels(recording.covariates["index"], recording.q, count)
+
+
+def block_labels(index: Array, q: Array, count: int = FOLDS) -> Array:
+    """The same of poses (n, joints) that were driven in the order of ``index`` (n,)."""
+    order = np.argsort(np.argsort(index, kind="stable"), kind="stable")
     blocks = min(2 * count, len(order))
     labels = (order * blocks // len(order)) % count
-    same = repetitions(recording.q)
+    same = repetitions(q)
     first = np.full(int(same.max(initial=-1)) + 1, len(order))
     np.minimum.at(first, same, order)
     return np.asarray(labels[np.argsort(order)][first[same]])

@@ -1,21 +1,21 @@
 """Least-squares adjustment of a station: all cameras, all poses and the body together.
 
 The body poses are eliminated from the normal equations (Schur complement), so the system to solve has only the unknowns
-of cameras and body, however many poses there are. Source of the elimination: Triggs, McLauchlan, Hartley, Fitzgibbon
-(2000), "Bundle adjustment: a modern synthesis", section 6.1.
+of cameras and body, however many poses there are.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
 
 from robcal.errors import NotIdentifiable
 from robcal.estimation.grouping import whitener
 from robcal.estimation.levenberg import Linearised, levenberg
 from robcal.estimation.robust import huber_costs, huber_weights
+from robcal.estimation.schur import Factor, Normals, SingularSystem, station_cofactors
 from robcal.estimation.summary import SolveSummary, TerminationSettings
 from robcal.photogrammetry.core.camera import INTRINSIC_NAMES, Camera, project_with_jacobians
 from robcal.photogrammetry.core.eccentricity import effective_point
@@ -24,6 +24,9 @@ from robcal.transforms import Array, invert, retract
 
 if TYPE_CHECKING:
     from robcal.photogrammetry.station.adjustment_loops import Blocks, Places
+
+_POSE_DAMPING = 1e-13
+"""Relative to the diagonal: a pose whose few marks leave a direction open stays in the adjustment."""
 
 
 def interior_basis(interior: Array) -> Array:
@@ -167,33 +170,7 @@ def _prior_terms(x: Unknowns, prior: Prior) -> tuple[Array, Array, float]:
     return N, b, cost
 
 
-@dataclass(frozen=True)
-class _System:
-    """Normal equations: ``matrix`` (g, g), ``right`` (g,) of the global unknowns, ``coupling`` (g, p, 6), and
-    ``pose_matrix`` (p, 6, 6), ``pose_right`` (p, 6) of the poses."""
-
-    matrix: Array
-    right: Array
-    coupling: Array
-    pose_matrix: Array
-    pose_right: Array
-
-    def reduced(self, damping: float = 0.0) -> tuple[Array, Array, Array]:
-        """Matrix and right side without the poses, and the inverses (p, 6, 6) of these; all diagonals damped."""
-        V, g = self.pose_matrix, len(self.matrix)
-        diagonal = np.einsum("pii->pi", V)
-        scale = np.sqrt(np.maximum(diagonal, 1e-300))
-        seen = diagonal.min(axis=1) > 0  # a pose whose marks were all left out keeps its value
-        inverse = np.zeros_like(V)
-        outer = scale[:, :, None] * scale[:, None, :]
-        inverse[seen] = np.linalg.inv(V[seen] / outer[seen] + (damping + 1e-13) * np.eye(6)) / outer[seen]
-        T = np.matmul(self.coupling.transpose(1, 0, 2), inverse).transpose(1, 0, 2).reshape(g, -1)
-        N = self.matrix - T @ self.coupling.reshape(g, -1).T
-        N[np.diag_indices(g)] += damping * np.diag(self.matrix)
-        return N, self.right - T @ self.pose_right.ravel(), inverse
-
-
-def _normal(lin: Linearisation, marks: MarkTable, x: Unknowns, prior: Prior, weights: Array) -> _System:
+def _normal(lin: Linearisation, marks: MarkTable, x: Unknowns, prior: Prior, weights: Array) -> Normals:
     e, c, p = len(x.world_T_exterior), len(x.interior), len(x.world_T_body)
     g = 6 * e + 9 * c + 3 * len(x.points)
     from robcal.photogrammetry.station.adjustment_loops import Sums, add_marks  # compiled
@@ -202,7 +179,8 @@ def _normal(lin: Linearisation, marks: MarkTable, x: Unknowns, prior: Prior, wei
     add_marks(_blocks(lin), _places(marks, e, c), weights, sums)
     N, b, _ = _prior_terms(x, prior)
     N += np.tril(sums.matrix) + np.tril(sums.matrix, -1).T
-    return _System(N, b + sums.right, sums.coupling, sums.pose_matrix, sums.pose_right)
+    V = sums.pose_matrix * (1.0 + _POSE_DAMPING * np.eye(6))
+    return Normals(N, sums.coupling.transpose(1, 0, 2), V, b + sums.right, sums.pose_right)
 
 
 def _blocks(lin: "Linearisation | StationDesign") -> "Blocks":
@@ -217,38 +195,18 @@ def _places(marks: MarkTable, e: int, c: int) -> "Places":
     return Places(marks.exterior, marks.camera, marks.target, marks.pose, e, c)
 
 
-@dataclass(frozen=True)
-class _Factor:
-    """Cholesky factor of a symmetric positive matrix scaled to unit diagonal."""
-
-    factor: tuple[Array, bool]
-    scale: Array
-
-    @classmethod
-    def of(cls, S: Array, names: list[str]) -> "_Factor":
-        """Raises NotIdentifiable, which names the unknowns, where the matrix is singular."""
-        scale = np.sqrt(np.maximum(np.diag(S), 1e-300))
-        unit = S / np.outer(scale, scale)
-        try:
-            return cls(linalg.cho_factor(unit, lower=True, check_finite=False), scale)
-        except linalg.LinAlgError:
-            vectors = np.linalg.eigh(unit)[1]
-            weak = np.abs(vectors[:, 0])
-            tied = [names[i] for i in np.argsort(weak)[::-1][:4] if weak[i] > 0.2]
-            raise NotIdentifiable(
-                "the images do not determine " + ", ".join(tied) + ": add poses that are tilted and at other "
-                "distances, or give camera files and keep intrinsics fixed",
-                tied,
-            ) from None
-
-    def solve(self, b: Array) -> Array:
-        """Solution of the system with the right side (n,)."""
-        return np.asarray(linalg.cho_solve(self.factor, b / self.scale, check_finite=False)) / self.scale
-
-    def inverse(self) -> Array:
-        """(n, n)."""
-        lower = linalg.lapack.dpotri(self.factor[0], lower=True)[0]
-        return (np.tril(lower) + np.tril(lower, -1).T) / np.outer(self.scale, self.scale)
+def _factor(normals: Normals, active: NDArray[np.bool_], names: Sequence[str], damping: float = 0.0) -> Factor:
+    """Raises NotIdentifiable, which names the unknowns, where the system is singular."""
+    try:
+        return Factor(normals, held=~active, damping=damping)
+    except SingularSystem as singular:
+        weak = np.abs(singular.weakest)
+        tied = [names[i] for i in np.argsort(weak)[::-1][:4] if weak[i] > 0.2]
+        raise NotIdentifiable(
+            "the images do not determine " + ", ".join(tied) + ": add poses that are tilted and at other "
+            "distances, or give camera files and keep intrinsics fixed",
+            tied,
+        ) from None
 
 
 def unknown_names(cameras: tuple[str, ...], exterior: list[str], ids: NDArray[np.int64]) -> list[str]:
@@ -317,14 +275,12 @@ def adjust_station(  # noqa: PLR0913 - options by keyword
     ------
     NotIdentifiable : the reduced normal matrix of the active unknowns is singular.
     """
-    on = np.flatnonzero(active)
-    active_names = [names[i] for i in on]
 
     def at(x: Unknowns) -> _At:
         lin = linearise(marks, x, cameras, noise)
         return _At(x, lin, 0.5 * (_cost(lin.residual, huber) + _prior_terms(x, prior)[2]))
 
-    def system_at(here: _At) -> tuple[Linearisation, Array, _System]:
+    def system_at(here: _At) -> tuple[Linearisation, Array, Normals]:
         weights = _weights(here.lin.residual, huber)
         clean = here.lin
         if not np.isfinite(clean.residual).all():
@@ -336,12 +292,8 @@ def adjust_station(  # noqa: PLR0913 - options by keyword
         basis = interior_basis(here.unknowns.interior)
 
         def propose(damping: float) -> tuple[_At, float]:
-            N, b, pose_inverse = system.reduced(damping)
-            step = np.zeros(len(active))
-            step[on] = _Factor.of(N[np.ix_(on, on)], active_names).solve(b[on])
-            rest = system.pose_right - np.einsum("gpi,g->pi", system.coupling, step)
-            pose_step = np.einsum("pij,pj->pi", pose_inverse, rest)
-            saved = 0.5 * float(step @ system.right + np.sum(pose_step * system.pose_right))
+            step, pose_step = _factor(system, active, names, damping).solve(system.b, system.s)
+            saved = 0.5 * float(step @ system.b + np.sum(pose_step * system.s))
             return at(_apply(here.unknowns, step, pose_step, basis)), saved
 
         return Linearised(here.half_cost, propose, lambda trial: trial.half_cost)
@@ -350,9 +302,7 @@ def adjust_station(  # noqa: PLR0913 - options by keyword
     settings = TerminationSettings(max_iterations, 12, 2.0 * tolerance / max(1, len(marks)), tolerance)
     end, summary = levenberg(local, at(start), settings)
     clean, weights, system = system_at(end)
-    N, _, pose_inverse = system.reduced()
-    inverse = np.zeros_like(N)
-    inverse[np.ix_(on, on)] = _Factor.of(N[np.ix_(on, on)], active_names).inverse()
+    factor = _factor(system, active, names)
     design = StationDesign(
         clean.residual,
         clean.by_exterior,
@@ -362,25 +312,21 @@ def adjust_station(  # noqa: PLR0913 - options by keyword
         end.lin.whitening,
         weights,
         active,
-        inverse,
-        pose_inverse,
-        system.coupling,
+        factor.cofactors(),
+        factor.station_inverse,
+        factor.station_response,
     )
     mark_cost = float(np.sum(clean.residual**2))
     return Adjusted(end.unknowns, design, mark_cost, summary)
 
 
 def covariance_blocks(design: StationDesign, marks: MarkTable, e: int, c: int) -> tuple[Array, Array]:
-    """Marginal covariances (p, 6, 6) of the poses and redundancy matrices (m, 2, 2) of the whitened marks.
+    """Marginal covariances (p, 6, 6) of the poses and redundancy matrices (m, 2, 2) of the marks, ``I - A Q A'``.
 
-    ``Q_pp = V^-1 + V^-1 W' Q_gg W V^-1`` per pose, ``Q_gp = -Q_gg W V^-1``; redundancy ``I - A Q A'``; ``e`` and ``c``
-    are the numbers of exterior and interior orientations.
+    ``e`` and ``c`` are the numbers of exterior and interior orientations.
     """
-    Q, Vi, W = design.reduced_inverse, design.pose_inverse, design.coupling
-    g, p = len(Q), len(Vi)
-    T = np.matmul(W.transpose(1, 0, 2), Vi)
-    Qgp = -np.matmul(Q, T.transpose(1, 0, 2).reshape(g, 6 * p)).reshape(g, p, 6)
-    Qpp = Vi - np.matmul(T.transpose(0, 2, 1), Qgp.transpose(1, 0, 2))
+    Q = design.reduced_inverse
+    Qpp, Qgp = station_cofactors(design.pose_inverse, design.pose_response, Q)
     from robcal.photogrammetry.station.adjustment_loops import covariances  # compiled
 
     covariance = np.empty((len(marks), 2, 2))

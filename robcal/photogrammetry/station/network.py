@@ -186,7 +186,8 @@ class StationDesign:
     weights : (m,) robust weights, all one in a final result.
     active : (g,) which global unknowns were adjusted.
     reduced_inverse : (g, g) covariance of the global unknowns, zeros where not adjusted.
-    pose_inverse : (p, 6, 6) inverse of each pose's own normal matrix; coupling (g, p, 6) global-pose normal matrix.
+    pose_inverse : (p, 6, 6) inverse of each pose's own normal matrix.
+    pose_response : (p, 6, g) derivative of each pose by the global unknowns.
     """
 
     residual: Array
@@ -199,7 +200,7 @@ class StationDesign:
     active: NDArray[np.bool_]
     reduced_inverse: Array
     pose_inverse: Array
-    coupling: Array
+    pose_response: Array
 
 
 @dataclass(frozen=True)

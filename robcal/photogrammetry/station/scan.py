@@ -56,7 +56,7 @@ def scan_moves(design: StationDesign, marks: MarkTable, cameras: int, poses: int
     X = with_pose @ design.pose_inverse[pose]
     score = score - np.einsum("nij,nj->ni", X, v[pose])
     own = own - X @ np.swapaxes(with_pose, -1, -2)
-    with_global = with_global - X @ np.moveaxis(design.coupling, 0, -1)[pose]
+    with_global = with_global + with_pose @ design.pose_response[pose]
     shape = (cameras, poses)
     s, o, w = score.reshape(*shape, 6), own.reshape(*shape, 6, 6), with_global.reshape(*shape, 6, g)
 

@@ -5,18 +5,23 @@ support; what stays ambiguous is left out.
 """
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from robcal.photogrammetry.core.camera import normalise, project, project_with_jacobians
+from robcal.estimation.gauss_newton import gauss_newton
+from robcal.estimation.summary import TerminationSettings
+from robcal.photogrammetry.core.camera import Camera, normalise, project, project_with_jacobians
 from robcal.photogrammetry.core.network import IntArray
 from robcal.photogrammetry.survey.matching import Geometry, Sightings
 from robcal.transforms import Array, transform
 
 _PARTNERS = 4
 """Images with which one is intersected."""
+_TERMINATION = TerminationSettings(6, cost_tolerance=1e-6)
+"""Of the intersection of one point; cost in px^2."""
 
 
 @dataclass(frozen=True)
@@ -183,19 +188,27 @@ def _fit_point(
     for _ in range(6):
         if len(rows) < 2:
             return None
-        for _ in range(4):
-            T = geometry.camera_T_body[sightings.image[rows]]
-            p = np.einsum("nij,j->ni", T[:, :3, :3], X) + T[:, :3, 3]
-            xy, d_point, _ = project_with_jacobians(geometry.camera, p)
-            J = np.einsum("nia,nab->nib", d_point, T[:, :3, :3])
-            r = sightings.xy[rows] - xy
-            A = np.einsum("nia,nib->ab", J, J)
-            if not np.all(np.isfinite(A)) or np.linalg.cond(A) > 1e10:
-                return None
-            X = X + np.linalg.solve(A, np.einsum("nia,ni->a", J, r))
-        residual = np.linalg.norm(r, axis=1)
+        T, xy = geometry.camera_T_body[sightings.image[rows]], sightings.xy[rows]
+        residuals, linearise = partial(_residuals, geometry.camera, T, xy), partial(_linearised, geometry.camera, T, xy)
+        X, _ = gauss_newton(linearise, residuals, np.add, X, _TERMINATION)
+        r, J = linearise(X)
+        N = J.T @ J
+        if np.linalg.cond(N) > 1e10:
+            return None
+        residual = np.linalg.norm(r.reshape(-1, 2), axis=1)
         if residual.max() < gate:
             sigma = max(float(np.sqrt(np.mean(residual**2))), float(np.median(sightings.sigma[rows])), 0.02)
-            return X, sigma**2 * np.linalg.inv(A), rows
+            return X, np.asarray(sigma**2 * np.linalg.inv(N)), rows
         rows = np.delete(rows, int(np.argmax(residual)))
     return None
+
+
+def _residuals(camera: Camera, camera_T_body: Array, xy: Array, X: Array) -> Array:
+    """(2m,) px of a point at X (3,), seen at ``xy`` (m, 2) from ``camera_T_body`` (m, 4, 4)."""
+    return (xy - project(camera, transform(camera_T_body, X))).ravel()
+
+
+def _linearised(camera: Camera, camera_T_body: Array, xy: Array, X: Array) -> tuple[Array, Array]:
+    """The same with the Jacobian (2m, 3)."""
+    predicted, by_point, _ = project_with_jacobians(camera, transform(camera_T_body, X))
+    return (xy - predicted).ravel(), (by_point @ camera_T_body[:, :3, :3]).reshape(-1, 3)

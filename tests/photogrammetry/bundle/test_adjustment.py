@@ -84,7 +84,7 @@ def test_normal_equations_against_a_dense_solution() -> None:
     step = np.linalg.solve(bordered, np.concatenate([A.T @ r, np.zeros(6)]))[:size]
 
     normals = build_normals(lin, None, order, bars)
-    factor = Factor(normals, datum.constraints(truth.points), np.zeros(k + 3 * t, dtype=bool))
+    factor = Factor(normals, datum.constraints(truth.points))
     dx, ds = factor.solve(normals.b, normals.s)
     scale = np.sqrt(np.diag(inverse))
     np.testing.assert_allclose(np.concatenate([dx, ds.ravel()]) / scale, step / scale, atol=1e-4)

@@ -1,0 +1,1 @@
+"""Systems of linear cameras: each reading is a plane, three planes are a point."""

@@ -1,0 +1,111 @@
+"""Lengths that links do not have, where a robot was identified from lengths of wires alone.
+
+Sag, stretch or a wrong scale of a wire fit into the robot with small residuals and make it worse. How far a link is off
+says little by itself: it has to be more than its own uncertainty and what links may deviate by explain, or a fault of
+the wire has to explain it better than the links do.
+"""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from robcal.calibration.calibrated import CalibratedRobot
+from robcal.calibration.identification import IdentifyOptions
+from robcal.calibration.instruments import IdentifiedInstruments
+from robcal.calibration.instruments.linearised import LinearInstruments, linearised
+from robcal.calibration.joint_log import JointLog
+from robcal.calibration.wire import LIMITS
+from robcal.diagnosis.core.fitting import solve
+from robcal.estimation.covariance import cofactor
+from robcal.physics.cause import DEVIATION
+
+USUAL_LENGTH = 2e-4
+"""m; deviation of a link that is usual. Less than that is no reason for an alarm."""
+BELIEVED_LENGTH = 6e-4
+"""m; standard deviation of the lengths of links where the campaign states none (`model.priors`)."""
+SURE = 3.5
+"""Standard deviations from which something is told: in a few of a thousand faultless campaigns."""
+WORDS: Mapping[str, str] = {
+    "radius": "runs over a pulley",
+    "sag": "sags",
+    "stretch": "stretches",
+    "scale": "has a wrong scale",
+    "offset": "has a wrong zero",
+}
+
+
+def wire_alarms(found: IdentifiedInstruments, log: JointLog, options: IdentifyOptions | None = None) -> list[str]:
+    """A sentence where links are off in a way that wires explain, or that nothing does; empty where all is usual.
+
+    Parameters
+    ----------
+    options : as for the identification; its priors are what is believed of single parameters.
+    """
+    identified = [p for p in found.placed.values() if p.robot is not None and not p.instrument.loop]
+    robot = identified[0].robot if identified else None
+    if robot is None or any(p.instrument.dimension > 1 for p in identified):
+        return []
+    options = options or IdentifyOptions()
+    links = _links(robot)
+    believed = {n: options.priors.get(n, BELIEVED_LENGTH) for n in links}
+    far = [n for n in links if abs(robot.values[n]) - USUAL_LENGTH > SURE * np.hypot(_sigma(robot, n), believed[n])]
+    told = [f"{n} {1e3 * robot.values[n]:+.2f} +- {1e3 * _sigma(robot, n):.2g} mm" for n in far]
+    reason = f"links are off by more than links may be ({', '.join(told)}), which a fault of the wire does"
+    best = 0.0
+    for placed in identified:
+        for kind in LIMITS:
+            if kind in placed.instrument.wire:
+                continue
+            name = f"{placed.instrument.name}.wire.{kind}"
+            linear = linearised(found, log, options, {placed.instrument.name: (kind,)})
+            strength, moved = _explained(linear, name, robot, options)
+            strength /= max(robot.sigma0, 1.0)
+            if strength > max(SURE, best) and moved:
+                best = strength
+                reason = f"a wire that {WORDS[kind]} explains it better than links that are off: " + ", ".join(
+                    f"{n} {1e3 * robot.values[n]:+.2f} mm would be {1e3 * (robot.values[n] + v):+.2f} mm"
+                    for n, v in moved.items()
+                )
+    if not far and best == 0.0:
+        return []
+    return [f"identified from wires alone: {reason}; verify in 6D before driving with this robot"]
+
+
+def _links(robot: CalibratedRobot) -> list[str]:
+    frames = {f.name for f in robot.model.frames}
+    parts = [(n, n.rpartition(".")) for n in robot.names]
+    return [n for n, (frame, _, kind) in parts if frame in frames and kind in ("x", "y", "z")]
+
+
+def _sigma(robot: CalibratedRobot, name: str) -> float:
+    return float(robot.sigma[robot.names.index(name)])
+
+
+def _explained(
+    linear: LinearInstruments, name: str, robot: CalibratedRobot, options: IdentifyOptions
+) -> tuple[float, dict[str, float]]:
+    """By how many standard deviations a parameter of a wire differs from nothing beside links as they are believed, and
+    the changes (m) of those lengths that it takes further than what is usual."""
+    rows = [linear.jacobian.reshape(-1, len(linear.names)), linear.prior]
+    left = [linear.residual.ravel(), linear.prior_residual]
+    for k, (n, value) in enumerate(zip(linear.names, linear.values, strict=True)):
+        size = _believed(n, robot, options)
+        if size:
+            rows.append(np.eye(1, len(linear.names), k) / size)
+            left.append(np.array([-value / size]))
+    J, r = np.concatenate(rows), np.concatenate(left)
+    at = linear.names.index(name)
+    others = np.delete(np.arange(J.shape[1]), at)
+    with_it, without = solve(J, r), np.insert(solve(J[:, others], r), at, 0.0)
+    sigma = float(np.sqrt(cofactor(J)[at, at]))
+    change = dict(zip(linear.names, with_it - without, strict=True))
+    moved = {n: float(change[n]) for n in _links(robot) if abs(change[n]) > USUAL_LENGTH}
+    return abs(float(with_it[at])) / sigma, moved
+
+
+def _believed(name: str, robot: CalibratedRobot, options: IdentifyOptions) -> float:
+    """Standard deviation (m, rad) that geometry is believed to have; 0 where nothing is, or a prior counts already."""
+    frame, _, kind = name.rpartition(".")
+    if name in options.priors or frame not in {f.name for f in robot.model.frames} or kind.startswith("elastic_"):
+        return 0.0
+    return BELIEVED_LENGTH if kind in ("x", "y", "z") else DEVIATION
