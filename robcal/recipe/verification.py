@@ -120,8 +120,8 @@ def verify_robot(
                 unstated = verify(beside, stated.subset(kept_out), used.select(kept_out))
             # the stated uncertainty is that of the robot as a table of poses states it; faults of the measuring are
             # told apart, but directions that nobody states are no user's
-            said = recorded if unstated is None else unstated
-            judged = {name: getattr(said, name) for name in ("normalised", "degrees", "p_value", "coverage_95")}
+            told = recorded if unstated is None else unstated
+            judged = {name: getattr(told, name) for name in ("normalised", "degrees", "p_value", "coverage_95")}
             outcome = replace(outcome, **judged)
             notes = [*notes, "uncertainties are judged without the faults of the measuring system that were found"]
     return RobotVerification(outcome, recorded, kept_out, tuple(notes), unstated, bool(foreign))

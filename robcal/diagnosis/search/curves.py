@@ -376,7 +376,7 @@ class _Folded:
         """
         fitted, at = int(self.ends[0]), self._at(joints)
         parts = [(N[np.ix_(at, at)], b[at], square, count) for N, b, square, count in self.folds]
-        gram, right = (np.sum([part[k] for part in parts], axis=0) for k in (0, 1))
+        gram, right = np.sum([part[0] for part in parts], axis=0), np.sum([part[1] for part in parts], axis=0)
         square, ridge = sum(part[2] for part in parts), _ridge(gram, fitted, self.variance)
 
         def evidence(N: Array, b: Array, total: float) -> float:
