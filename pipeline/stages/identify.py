@@ -8,6 +8,7 @@ from pipeline.artifacts import CALIBRATED, DIAGNOSED_INSTRUMENTS, HAND_EYE, IDEN
 from pipeline.bodies import body_for_robot
 from pipeline.campaign import Campaign
 from pipeline.instrument_results import instrument_notes, instruments_result
+from pipeline.model_priors import model_priors
 from pipeline.runs import Run
 from pipeline.stages.base import Context, Outcome, Stage
 from pipeline.stages.observations import build_instruments, build_recording, corrections_of
@@ -48,6 +49,7 @@ def options_of(campaign: Campaign, stated: bool) -> IdentifyOptions:
         objective="basis" if chosen.objective == "basis_norm" else "maximum_likelihood",
         statics=chosen.statics,
         joint_sigma=None if chosen.joint_sigma_deg is None else float(np.radians(chosen.joint_sigma_deg)),
+        priors={} if campaign.robot is None else model_priors(chosen.priors, campaign.robot),
         covariance="auto" if stated else "estimated",
     )
 

@@ -193,7 +193,10 @@ def _step(joint: Any, mass: float, cog: Array) -> UrdfStep:
     if joint.type not in ("revolute", "continuous", "prismatic", "fixed"):
         raise InvalidInput(f"URDF joint '{joint.name}' is of type '{joint.type}'; only single-axis joints form a chain")
     if getattr(joint, "mimic", None) is not None:
-        raise InvalidInput(f"URDF joint '{joint.name}' mimics another one; coupled joints are given as a term instead")
+        raise InvalidInput(
+            f"URDF joint '{joint.name}' mimics another one: describe the robot in a robot.yaml, whose frames may turn "
+            "by the angles of joints ('angle')"
+        )
     origin = np.eye(4) if joint.origin is None else np.asarray(joint.origin, dtype=float)
     axis = np.array([1.0, 0.0, 0.0]) if joint.axis is None else np.asarray(joint.axis, dtype=float)
     length = float(np.linalg.norm(axis))
