@@ -37,7 +37,8 @@ from pipeline.campaign_reader import read_campaign
 from pipeline.runner import run_campaign
 from pipeline.runs import open_run
 from robcal.calibration.calibrated import CalibratedRobot
-from robcal.joint_adjustment.adjustment import JointAdjustment, adjust_jointly
+from robcal.joint_adjustment.adjustment import adjust_jointly
+from robcal.joint_adjustment.result import JointAdjustment
 from robcal.recipe.identification import Identification
 
 Record = dict[str, Any]

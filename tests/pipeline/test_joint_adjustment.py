@@ -53,6 +53,14 @@ def test_joint_adjustment_of_a_run_and_back(tmp_path: Path) -> None:
     assert np.allclose(load_calibrated(run).covariance, staged.covariance)
 
 
+def test_joint_adjustment_of_what_it_does_not_know_is_refused(tmp_path: Path) -> None:
+    make_own(tmp_path, seed=4, robot="ur10", poses=3, verify=1, kept_out=1)
+    stated = {"xyz_mm": [0, 0, 0], "rpy_deg": [0, 0, 0]}
+    edit_yaml(tmp_path / "campaign.yaml", lambda d: d.update(model={"adjustment": "joint"}, flange_T_tool=stated))
+    with pytest.raises(InvalidInput, match="joint' knows nothing of what flange_T_tool states"):
+        read_campaign(tmp_path)
+
+
 def test_joint_adjustment_without_a_station_is_refused(tmp_path: Path) -> None:
     make_own(tmp_path, seed=4, robot="ur10", poses=3, verify=1, kept_out=1)
 
