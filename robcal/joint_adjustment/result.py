@@ -22,6 +22,7 @@ class JointAdjustment:
     robot : with the covariance that cameras and body have a part in; its joints scatter as estimated.
     orientation : the station with its cameras, covariance, body and noise as adjusted now. The linearised model inside
         is still that of the station by itself.
+    relative : (p, p) covariance of its parameters against frames that the cameras as adjusted measure.
     joint_sigma : (N,) scatter of the joints, rad or m: what they do not repeat and what the model lacks.
     loose : rows of the joint log of poses found not to stand where the robot's joints say.
     rejected : marks left out beside those that the station left out.
@@ -31,6 +32,7 @@ class JointAdjustment:
 
     robot: CalibratedRobot
     orientation: StationOrientation = field(repr=False)
+    relative: Array = field(repr=False)
     joint_sigma: Array
     loose: tuple[int, ...]
     rejected: tuple[RejectedMark, ...]
@@ -87,6 +89,7 @@ def result_of(
     return JointAdjustment(
         robot=adjusted,
         orientation=_oriented(problem, state, found, orientation, rejected),
+        relative=found.robot_alone,
         joint_sigma=problem.joint_sigma,
         loose=tuple(sorted(loose)),
         rejected=tuple(rejected),
