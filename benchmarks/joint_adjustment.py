@@ -7,11 +7,11 @@
 A robot carries a plate of 5 to 12 targets before one to three cameras (``fixtures.own_station``, at the level of
 marks): 10 to 100 poses, 0.05 px, a tenth of the marks hidden, single targets in a twentieth of the images, lenses from
 files that are a little off, joints that repeat to 0.3 to 2.3 thousandths of a degree. Both results come from the same
-run (``pipeline run`` up to the identification, or with ``--diagnosed`` up to the diagnosis, whose robot is in force). Truth: 500 new poses, in the world of the first camera as it really
-stands. `error`: mean distance of the tool's origin; `in the cell`: the same after the best fit of one frame, which
-leaves what no shift of the station explains. Regions: 95 % ellipsoids of the place where the tool will be, joints
-scattering; NEES the squared normalised error per degree of freedom. Records are appended to ``--out`` and not run
-again.
+run: ``pipeline run`` up to the identification, with ``--diagnosed`` up to the diagnosis, whose robot is in force.
+Truth: 500 new poses, in the world of the first camera as it really stands. `error`: mean distance of the tool's origin;
+`in the cell`: the same after the best fit of one frame, which leaves what no shift of the station explains. Regions:
+95 % ellipsoids of the place where the tool will be, joints scattering; NEES the squared normalised error per degree of
+freedom. Records are appended to ``--out`` and not run again.
 """
 
 from __future__ import annotations
