@@ -15,8 +15,8 @@ from robcal.calibration.instruments import IdentifiedInstruments
 from robcal.calibration.instruments.linearised import LinearInstruments, linearised
 from robcal.calibration.joint_log import JointLog
 from robcal.calibration.wire import LIMITS
-from robcal.diagnosis.core.fitting import solve
 from robcal.estimation.covariance import cofactor
+from robcal.estimation.minimum_norm import solve
 from robcal.physics.cause import DEVIATION
 
 USUAL_LENGTH = 2e-4
