@@ -1,7 +1,5 @@
 """Whole diagnoses of concealed campaigns; the effects are drawn by the fixtures, whose physics are their own."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path
