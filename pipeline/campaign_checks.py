@@ -23,6 +23,12 @@ def contradictions(entry: CampaignEntry) -> Iterator[Contradiction]:
         yield (("robot",), "a robot needs its joint angles: add 'poses: poses.csv'")
     if not (surveyed or measured or entry.station is not None or entry.hand_eye is not None):
         yield ((), "nothing to work on: give a body a 'survey', or add a 'station', 'measurements' or 'hand_eye'")
+    if entry.model.adjustment == "joint" and (entry.station is None or entry.robot is None or entry.instruments):
+        yield (
+            ("model", "adjustment"),
+            "'adjustment: joint' adjusts a robot with the marks of its own station: it needs 'robot', and a 'station' "
+            "with images or observations as the only instrument; else write 'adjustment: staged'",
+        )
     yield from _hand_eye(entry)
     carried = entry.station.body if entry.station else None
     for key, place in ((entry.body, ("body",)), (carried, ("station", "body"))):

@@ -13,6 +13,7 @@ from pipeline.campaign_checks import Contradiction, contradictions, instrument_c
 from pipeline.campaign_schema import FORMAT, CampaignEntry, InstrumentEntry, StationCameraEntry, SurveyEntry, TableUse
 from pipeline.correction import module_file
 from pipeline.instrument_frames import cell_frames
+from pipeline.model_priors import model_priors
 from pipeline.pose_images import images_by_stem, match_poses, poses_from_images
 from robcal.errors import InvalidInput, RobcalError
 from robcal.files.body_file import check_ring_codes, read_body
@@ -167,6 +168,8 @@ class _Reader:
                 "the robot file states no masses (mass_kg, cog_mm): sag under the arm's own weight is identified where "
                 "the poses show it, but what another payload does to the arm cannot be predicted"
             )
+        if robot is not None:
+            self._part(partial(self._check_priors, robot))
         hand_eye = self._part(partial(self._hand_eye, poses))
         if hand_eye is not None and poses is None:
             poses = self._flange_poses()
@@ -225,13 +228,13 @@ class _Reader:
         poses: Poses | None,
         bodies: Mapping[str, BodySource],
     ) -> dict[str, InstrumentSource]:
-        """All instruments; none where there is but one of whose world and tool nothing is stated."""
+        """All instruments; none where there is but one and nothing is stated of its world, tool or robot's geometry."""
         entry = self.entry
         stated = {"world_T_base": entry.world_T_base, "flange_T_tool": entry.flange_T_tool}
         for key in (k for k, v in stated.items() if v is not None and entry.instruments):
             raise self._error((key,), f"'{key}' serves a campaign with one instrument: state it at the instrument")
         loops = any(table.kind == "constraints" for table in measurements)
-        if not entry.instruments and not any(stated.values()) and not loops:
+        if not entry.instruments and not any(stated.values()) and not loops and not entry.model.priors:
             return {}
         tables: dict[str, tuple[MeasuredTable, ...] | None] = {}
         if entry.station is not None:
@@ -258,6 +261,12 @@ class _Reader:
             name: InstrumentSource(found, entry.instruments.get(name), worlds[name], tools[name])
             for name, found in tables.items()
         }
+
+    def _check_priors(self, robot: RobotModel) -> None:
+        try:
+            model_priors(self.entry.model.priors, robot)
+        except InvalidInput as error:
+            raise self._error(("model", "priors"), str(error)) from None
 
     def _check_instrument(
         self, name: str, use: InstrumentEntry, table: MeasuredTable, bodies: Mapping[str, BodySource]

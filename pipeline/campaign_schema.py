@@ -143,6 +143,8 @@ class ModelEntry(Entry):
     robust: bool = True
     statics: Literal["one_step", "converged"] = "converged"
     joint_sigma_deg: NotNegative | None = None
+    adjustment: Literal["staged", "joint"] = "staged"
+    priors: dict[Text, Positive] = Field(default_factory=dict)
 
 
 class BundleEntry(Entry):

@@ -263,14 +263,19 @@ def compensate(
 
 
 @app.command()
-def report(run_folder: RunFolder, quiet: Quiet = False, as_json: Json = False) -> None:
+def report(
+    run_folder: RunFolder,
+    pdf: Annotated[bool, typer.Option("--pdf", help="Print it to report.pdf as well (needs Chromium).")] = False,
+    quiet: Quiet = False,
+    as_json: Json = False,
+) -> None:
     """Write the report again."""
     with answers("report", as_json, quiet) as answer:
         from pipeline.commands import report_again
 
-        path = report_again(run_folder)
-        answer["report"] = str(path)
-        LOG.info(str(path))
+        for kind, path in report_again(run_folder, pdf=pdf).items():
+            answer[kind] = str(path)
+            LOG.info(str(path))
 
 
 @app.command(short_help="Render a small campaign and run it.")

@@ -51,13 +51,22 @@ def diagnose_place(place: Path, out: Path | None, workers: int | None) -> tuple[
     return done, read_json(done.run.diagnosis)
 
 
-def report_again(folder: Path) -> Path:
-    """Write the report of a run again from what lies in it."""
+def report_again(folder: Path, *, pdf: bool = False) -> dict[str, Path]:
+    """Write the report of a run again from what lies in it; its files by kind.
+
+    Raises
+    ------
+    NoPrinter : a PDF is wanted, and there is no browser that prints.
+    """
+    from pipeline.report.pdf import print_report
     from pipeline.stages.report import write_run_report
 
     run = open_run(folder)
     with run.lock():
-        return write_run_report(run)
+        files = {"report": write_run_report(run)}
+        if pdf:
+            files["pdf"] = print_report(run.report, run.folder / "report.pdf")
+    return files
 
 
 def run_demo(folder: Path, workers: int | None) -> Done:

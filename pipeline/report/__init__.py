@@ -19,7 +19,9 @@ def write_report(run: Run) -> Path:
     """
     material = Material(run)
     chapters = [chapter for chapter in all_chapters(material) if chapter.blocks]
-    write_text(run.report, render(material.name, verdict_of(material), chapters, provenance(material)))
+    write_text(
+        run.report, render(material.name, verdict_of(material), chapters, provenance(material), material.all_poses)
+    )
     return run.report
 
 

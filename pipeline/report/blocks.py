@@ -10,6 +10,12 @@ from pipeline.json_io import plain
 Grade = Literal["good", "care", "bad", "none"]
 
 
+def script_json(value: object) -> str:
+    """JSON that is safe inside a script element."""
+    text = json.dumps(plain(value), allow_nan=False)
+    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+
+
 @dataclass(frozen=True)
 class Text:
     """A paragraph; `kind` 'lead', 'note' or 'plain'."""
@@ -29,7 +35,10 @@ class Bullets:
 
 @dataclass(frozen=True)
 class Table:
-    """A table; cells are text already formatted. `numeric` columns are set flush right."""
+    """A table; cells are text already formatted. `numeric` columns are set flush right.
+
+    `poses`: the pose (row in the joint log) that each row is about, so that it can be chosen by its first cell.
+    """
 
     columns: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
@@ -37,11 +46,16 @@ class Table:
     numeric: frozenset[int] = frozenset()
     shown: int = 60
     emphasis: frozenset[int] = frozenset()
+    poses: tuple[int | None, ...] = ()
 
 
 @dataclass(frozen=True)
 class Figure:
-    """A Plotly figure as plain data, with a caption that says what is to be seen."""
+    """A Plotly figure as plain data, with a caption that says what is to be seen.
+
+    A trace's `customdata` holds the pose (row in the joint log) of each point, or a list of them: choosing one marks it
+    in every plot.
+    """
 
     data: tuple[Mapping[str, Any], ...]
     layout: Mapping[str, Any]
@@ -53,8 +67,7 @@ class Figure:
     @property
     def payload(self) -> str:
         """JSON that is safe inside a script element."""
-        text = json.dumps(plain({"data": list(self.data), "layout": dict(self.layout)}), allow_nan=False)
-        return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+        return script_json({"data": list(self.data), "layout": dict(self.layout)})
 
 
 @dataclass(frozen=True)
@@ -125,8 +138,9 @@ def table(
     text: Sequence[int] = (0,),
     emphasis: Sequence[int] = (),
     shown: int = 60,
+    poses: Sequence[int | None] = (),
 ) -> Table:
     """A table from anything that can be printed; all columns but `text` are numbers."""
     numeric = frozenset(range(len(columns))) - frozenset(text)
     cells = tuple(tuple("" if c is None else str(c) for c in row) for row in rows)
-    return Table(tuple(columns), cells, caption, numeric, shown, frozenset(emphasis))
+    return Table(tuple(columns), cells, caption, numeric, shown, frozenset(emphasis), tuple(poses))

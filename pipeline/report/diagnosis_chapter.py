@@ -161,8 +161,9 @@ def _with_sigma(value: Any, sigma: Any) -> str:
 def _plots(material: Material, causes: list[dict[str, Any]]) -> list[Block]:
     blocks: list[Block] = []
     evidence = material.evidence
+    poses = {name: row for row, name in enumerate(material.all_poses)}
     for one in evidence.causes if evidence else ():
-        blocks.append(evidence_figure(one, said(one.cause)))
+        blocks.append(evidence_figure(one, said(one.cause), poses))
     blocks += _image_plots(material, causes)
     robot_causes = [c for c in causes if c.get("stage") in ("robot", "body", "sensor", "wire", "camera")]
     if material.calibrated is not None and robot_causes:

@@ -1,5 +1,6 @@
 """The plot that convinces: what each pose says on its own about a cause, against its covariate, with the fitted law."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ _STATES = {-1.0: (BEFORE, "moved down"), 0.0: (GREY, "approach unknown"), 1.0: (
 _BINS = 14
 
 
-def evidence_figure(evidence: CauseEvidence, cause: str) -> Figure:
+def evidence_figure(evidence: CauseEvidence, cause: str, poses: Mapping[str, int]) -> Figure:
     """Points of single poses, means of groups of them, and the fitted law."""
     factor, unit, what = coordinate(evidence.coordinate)
     names = list(evidence.variables)
@@ -27,7 +28,9 @@ def evidence_figure(evidence: CauseEvidence, cause: str) -> Figure:
         for out, symbol, name in ((False, "circle", "single pose"), (True, "diamond-open", "kept-out pose")):
             mine = which & (evidence.kept_out == out)
             if mine.any():
-                data.append(_points(evidence, mine, x, factor, (colour, symbol), f"{name}{told}", unit))
+                point = _points(evidence, mine, x, factor, (colour, symbol), f"{name}{told}", unit)
+                rows = [poses.get(p) for p, m in zip(evidence.poses, mine, strict=True) if m]
+                data.append({**point, "customdata": rows})
         means = _means(x[which], evidence.measured[which] * factor, evidence.sigma[which] * factor)
         if means is not None:
             data.append(

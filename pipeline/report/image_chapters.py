@@ -147,7 +147,15 @@ def residual_chapter(material: Material) -> Chapter:
             mine = station.marks.camera == c
             camera = station.cameras[c]
             size = (camera.width, camera.height)
-            blocks.append(_vectors(f"camera {name}", station.marks.xy[mine], pixels[mine], size))
+            blocks.append(
+                _vectors(
+                    f"camera {name}",
+                    station.marks.xy[mine],
+                    pixels[mine],
+                    size,
+                    station.poses[station.marks.pose[mine]],
+                )
+            )
     return Chapter(
         "residuals",
         "Image residuals",
@@ -157,7 +165,9 @@ def residual_chapter(material: Material) -> Chapter:
     )
 
 
-def _vectors(name: str, xy: Array, residual: Array, size: tuple[int, int]) -> Figure:
+def _vectors(
+    name: str, xy: Array, residual: Array, size: tuple[int, int], poses: NDArray[np.int64] | None = None
+) -> Figure:
     rms = float(np.sqrt(np.mean(residual**2))) if len(residual) else 0.0
     length = 0.025 * max(size)
     factor = length / max(rms * 2.0, 1e-12)
@@ -174,7 +184,8 @@ def _vectors(name: str, xy: Array, residual: Array, size: tuple[int, int]) -> Fi
             _arrows(xy[rows], tips),
             f"residuals x {magnification:g}",
             line={"color": GREY, "width": 1},
-            hoverinfo="skip",
+            hoverinfo="skip" if poses is None else "none",
+            customdata=[] if poses is None else np.repeat(poses[rows], 3).tolist(),
             opacity=0.55,
         ),
         trace(

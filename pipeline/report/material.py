@@ -42,13 +42,14 @@ class Material:
     @cached_property
     def campaign_folder(self) -> Path:
         """Folder of the campaign."""
-        return campaign_of(self.run)
+        path = campaign_of(self.run)
+        return path.parent if path.suffix else path
 
     @cached_property
     def campaign(self) -> Campaign | None:
         """The campaign, None if it was moved or changed so that it cannot be read."""
         try:
-            return read_campaign(self.campaign_folder)
+            return read_campaign(campaign_of(self.run))
         except RobcalError:
             return None  # the report tells what the run itself holds
 
@@ -131,7 +132,8 @@ class Material:
     @cached_property
     def calibrated(self) -> CalibratedRobot | None:
         """The calibrated robot with what the diagnosis added."""
-        found = self.find(artifacts.CALIBRATED)
+        adjusted = self.find(artifacts.ADJUSTED)
+        found = self.find(artifacts.CALIBRATED) if adjusted is None else adjusted.robot
         return found if found is not None or self.identification is None else self.identification.robot
 
     @cached_property
@@ -150,6 +152,13 @@ class Material:
         if self.campaign is not None and self.campaign.poses is not None:
             return self.campaign.poses.names
         return ()
+
+    @cached_property
+    def all_poses(self) -> tuple[str, ...]:
+        """Names of all poses that rows refer to, also where the campaign is gone."""
+        robot = self.calibrated
+        count = len(robot.q) if robot is not None and robot.q is not None else 0
+        return tuple(self.pose_name(row) for row in range(max(count, len(self.pose_names))))
 
     def pose_name(self, row: int) -> str:
         """Name of a pose."""

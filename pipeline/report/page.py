@@ -4,6 +4,7 @@ Where a report comes from: version, settings, hashes of the inputs.
 """
 
 import base64
+import gzip
 import hashlib
 import json
 import platform
@@ -18,8 +19,9 @@ from markupsafe import Markup
 from plotly.offline import get_plotlyjs
 
 from pipeline.json_io import plain
-from pipeline.report.blocks import Bullets, Chapter, Figure, Pictures, Table, Text, Verdict
+from pipeline.report.blocks import Bullets, Chapter, Figure, Pictures, Table, Text, Verdict, script_json
 from pipeline.report.material import Material
+from pipeline.report.style import NIGHT
 from pipeline.sources import all_modules, code_version
 
 _LIBRARIES = ("numpy", "scipy", "casadi", "opencv-contrib-python-headless", "pycolmap")
@@ -81,13 +83,17 @@ def _version(package: str) -> str:
 _HERE = Path(__file__).parent
 
 
-def render(name: str, verdict: Verdict, chapters: Sequence[Chapter], source: Provenance) -> str:
-    """The report as HTML.
+def render(
+    name: str, verdict: Verdict, chapters: Sequence[Chapter], source: Provenance, poses: Sequence[str] = ()
+) -> str:
+    """The report as HTML; ``poses`` are the names behind the numbers that plots, rows and images carry.
 
-    A content security policy forbids every request and every script but the two inlined here (by their hashes).
+    A content security policy forbids every request and every script but the two inlined here (by their hashes): our
+    own, and Plotly, which lies packed in the page and is unpacked by it.
     """
     figures = any(isinstance(b, Figure) for chapter in chapters for b in chapter.blocks)
-    scripts = [*([get_plotlyjs()] if figures else []), _text("report.js")]
+    library = get_plotlyjs() if figures else ""
+    script = _text("report.js")
     return (
         _environment()
         .get_template("report.html")
@@ -97,8 +103,12 @@ def render(name: str, verdict: Verdict, chapters: Sequence[Chapter], source: Pro
             chapters=chapters,
             source=source,
             style=Markup(_text("style.css")),
-            scripts=[Markup(script) for script in scripts],
-            hashes=[_hash(script) for script in scripts],
+            script=Markup(script),
+            library=_packed(library) if library else "",
+            hashes=[_hash(text) for text in (script, library) if text],
+            night=Markup(script_json(NIGHT)),
+            poses=poses,
+            poses_json=Markup(script_json(poses)),
         )
     )
 
@@ -106,6 +116,11 @@ def render(name: str, verdict: Verdict, chapters: Sequence[Chapter], source: Pro
 @cache
 def _text(name: str) -> str:
     return (_HERE / name).read_text(encoding="utf-8")
+
+
+def _packed(script: str) -> str:
+    """Packed and in letters; the same script gives the same letters."""
+    return base64.b64encode(gzip.compress(script.encode(), 9, mtime=0)).decode("ascii")
 
 
 def _hash(script: str) -> str:

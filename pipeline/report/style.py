@@ -15,6 +15,19 @@ PURPLE = "#CC79A7"
 GREY = "#8A929C"
 INK = "#1F2933"
 GRID = "#E4E7EB"
+PAPER = "#FFFFFF"
+NIGHT = {
+    INK: "#E6EAEE",
+    GRID: "#333D48",
+    PAPER: "#181D23",
+    "#FFF": "#181D23",
+    AFTER: "#4DA6E8",
+    GREY: "#8A929C",
+    "RGBA(255,255,255,0.85)": "rgba(24,29,35,0.85)",
+    "#6B7280": "#A8B0BA",
+    "#9AA5B1": "#66717D",
+}
+"""Colours of a plot on paper and on a dark screen, keys in capitals."""
 CATEGORIES = (AFTER, BEFORE, GREEN, PURPLE, SKY, ACCENT, "#6B7280", "#B8A200")
 
 
@@ -29,8 +42,8 @@ def layout(x: str = "", y: str = "", **more: Any) -> dict[str, Any]:
     axis["automargin"] = True
     out: dict[str, Any] = {
         "font": {"family": "system-ui, sans-serif", "size": 13, "color": INK},
-        "paper_bgcolor": "#FFFFFF",
-        "plot_bgcolor": "#FFFFFF",
+        "paper_bgcolor": PAPER,
+        "plot_bgcolor": PAPER,
         "margin": {"l": 60, "r": 20, "t": 12, "b": 50},
         "xaxis": axis | {"title": {"text": x}},
         "yaxis": axis | {"title": {"text": y}},
@@ -54,7 +67,7 @@ def scene(data: Iterable[Mapping[str, Any]], up: Any = (0.0, 0.0, 1.0), **more: 
     side /= np.linalg.norm(side)
     eye = 1.6 * (0.62 * side + 0.62 * np.cross(side, z)) + 0.6 * z
     xyz = ("x", "y", "z")
-    axis = {"backgroundcolor": "#FFFFFF", "gridcolor": GRID, "zerolinecolor": GRID, "showspikes": False}
+    axis = {"backgroundcolor": PAPER, "gridcolor": GRID, "zerolinecolor": GRID, "showspikes": False}
     ranges = _ranges(list(data))
     span = ranges[:, 1] - ranges[:, 0]
     view = {
@@ -99,6 +112,11 @@ def trace(form: str, coordinates: Sequence[Any], name: str, **more: Any) -> dict
     kind, _, mode = form.partition(" ")
     head = {"type": kind, "mode": mode} if mode else {"type": kind}
     return {**head, **dict(zip("xyz", coordinates, strict=False)), "name": name, **more}
+
+
+def linked(rows: Any, count: int) -> list[int]:
+    """`customdata` of a trace of ``count`` points: the pose of each; empty where they are not one a pose."""
+    return [int(row) for row in rows] if len(rows) == count else []
 
 
 def level_line(axis: str, value: object) -> dict[str, Any]:

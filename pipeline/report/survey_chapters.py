@@ -5,6 +5,7 @@ import numpy as np
 from pipeline.report.blocks import Block, Chapter, Figure, Table, Text, table
 from pipeline.report.material import Material
 from pipeline.report.style import ACCENT, AFTER, BEFORE, CATEGORIES, GREEN, GREY, label, number, rounded, scene, trace
+from robcal.calibration.measurements import Rows
 from robcal.photogrammetry.core.camera import INTRINSIC_NAMES, Camera
 from robcal.photogrammetry.core.network import CameraNetwork, LengthResult
 from robcal.photogrammetry.station.network import StationOrientation
@@ -140,7 +141,7 @@ def network_chapter(material: Material) -> Chapter:
     if material.station is not None:
         blocks.append(_station_scene(material.station, material))
     elif frames is not None and len(frames.pose):
-        blocks.append(_poses_scene(frames.world_T_body, [material.pose_name(int(p)) for p in frames.pose]))
+        blocks.append(_poses_scene(frames.world_T_body, frames.pose, material))
     return Chapter("network", "The network in space", "Drag to turn, scroll to come nearer.", tuple(blocks))
 
 
@@ -168,13 +169,16 @@ def _lines(xyz: tuple[list[float | None], ...], name: str, colour: str, width: i
     )
 
 
-def _dots(points: Array, text: list[str], name: str, colour: str, size: float = 3) -> dict[str, object]:
+def _dots(
+    points: Array, text: list[str], name: str, colour: str, size: float = 3, poses: Rows | tuple[()] = ()
+) -> dict[str, object]:
     return trace(
         "scatter3d markers",
         (rounded(points[:, 0], 6), rounded(points[:, 1], 6), rounded(points[:, 2], 6)),
         name,
         text=[label(t) for t in text],
         marker={"size": size, "color": colour},
+        customdata=[int(p) for p in poses],
         hovertemplate="%{text}<extra>" + label(name) + "</extra>",
     )
 
@@ -209,8 +213,10 @@ def _station_scene(station: StationOrientation, material: Material) -> Figure:
     ]
     body = station.body.points[station.body.known] if hasattr(station.body, "known") else station.body.points
     targets = (body @ np.swapaxes(station.world_T_body[:, :3, :3], 1, 2) + centres[:, None]).reshape(-1, 3)
-    data.append(_dots(targets, [""] * len(targets), "targets in all poses", GREY, 1.5))
-    data.append(_dots(centres, [material.pose_name(int(p)) for p in station.poses], "measured poses", GREEN, 3))
+    per_pose = np.repeat(station.poses, len(body))
+    data.append(_dots(targets, [""] * len(targets), "targets in all poses", GREY, 1.5, per_pose))
+    names = [material.pose_name(int(p)) for p in station.poses]
+    data.append(_dots(centres, names, "measured poses", GREEN, 3, station.poses))
     # the cameras' own upward direction, or the robot's where it is known
     up = -stands[0][:3, 1]
     if material.calibrated is not None and material.calibrated.model.world_T_base is not None:
@@ -224,10 +230,11 @@ def _station_scene(station: StationOrientation, material: Material) -> Figure:
     )
 
 
-def _poses_scene(frames: Array, names: list[str]) -> Figure:
+def _poses_scene(frames: Array, poses: Rows, material: Material) -> Figure:
     centres = frames[:, :3, 3]
     size = 0.06 * float(np.max(np.ptp(centres, axis=0), initial=1e-3))
-    data = [_dots(centres, names, "measured poses", AFTER, 3)]
+    names = [material.pose_name(int(p)) for p in poses]
+    data = [_dots(centres, names, "measured poses", AFTER, 3, poses)]
     for k, colour in enumerate((ACCENT, GREEN, BEFORE)):
         ends = centres + size * frames[:, :3, k]
         line: tuple[list[float | None], ...] = tuple(

@@ -6,7 +6,21 @@ import numpy as np
 
 from pipeline.report.blocks import Block, Chapter, Figure, Table, Text, table
 from pipeline.report.material import Material
-from pipeline.report.style import AFTER, BEFORE, label, layout, level_line, number, percent, probability, rounded, trace
+from pipeline.report.style import (
+    AFTER,
+    BEFORE,
+    PAPER,
+    label,
+    layout,
+    level_line,
+    linked,
+    number,
+    percent,
+    probability,
+    rounded,
+    trace,
+)
+from robcal.calibration.measurements import Rows
 from robcal.calibration.observations import FrameObservations
 from robcal.calibration.verification import TEST_VECTORS, Verification
 from robcal.transforms import Array, skew
@@ -87,9 +101,10 @@ def verification_chapter(material: Material) -> Chapter:
         names = [material.pose_name(int(r)) for r in rows]
         noise = noise_by_tool(material)
         blocks += [error_table(verification, noise, full=True)]
-        blocks += [_bars(verification, names, tolerance_mm(material)), _histogram(verification)]
+        blocks += [_errors(verification, names, rows, tolerance_mm(material)), _histogram(verification, rows)]
+        blocks.append(_pose_table(verification, names, rows))
         blocks += [_iso(verification)] if verification.iso is not None else []
-        blocks += [_calibration_of_uncertainty(verification, names), Text(_honesty(verification))]
+        blocks += [_calibration_of_uncertainty(verification, names, rows), Text(_honesty(verification))]
     return Chapter("verification", "Pose errors before and after", _lead(material), tuple(blocks))
 
 
@@ -115,58 +130,43 @@ def tolerance_mm(material: Material) -> float | None:
     return None if told is None else float(told["tolerance_mm"])
 
 
-def _bars(v: Verification, names: list[str], tolerance: float | None) -> Figure:
-    errors = v.errors["0"] * 1000
-    order = [label(n) for n in names]
+def _errors(v: Verification, names: list[str], rows: Rows, tolerance: float | None) -> Figure:
+    """Both errors of every pose, on one axis by their logarithm: they lie a factor of ten or more apart."""
+    size = v.errors["0"] * 1000
+    # several points of one pose follow one another: each gets a place of its own
+    order = [label(n) for n in names] if len(names) == len(size) else [str(i + 1) for i in range(len(size))]
     data = []
-    if v.nominal_errors is not None and len(v.nominal_errors["0"]) == len(errors):
-        data.append(_bar(order, v.nominal_errors["0"] * 1000, "before (nominal, best cell)", BEFORE))
-    data.append(_bar(order, errors, "after (calibrated)", AFTER))
-    buttons = [
-        {"label": told, "method": "relayout", "args": [{"yaxis.type": kind}]}
-        for told, kind in (("linear", "linear"), ("logarithmic", "log"))
-    ]
-    menu = {
-        "type": "buttons",
-        "direction": "right",
-        "x": 1,
-        "xanchor": "right",
-        "y": 1.02,
-        "yanchor": "bottom",
-        "buttons": buttons,
-        "showactive": True,
-        "bgcolor": "#fff",
-    }
+    if v.nominal_errors is not None and len(v.nominal_errors["0"]) == len(size):
+        data.append(_dots(order, v.nominal_errors["0"] * 1000, "before (nominal, best cell)", BEFORE, rows))
+    data.append(_dots(order, size, "after (calibrated)", AFTER, rows))
+    lines = [] if tolerance is None else [level_line("y", tolerance)]
+    told = "" if tolerance is None else f" Dashed: tolerance, {number(tolerance)} mm."
     return Figure(
         tuple(data),
         layout(
             "pose",
-            "error (mm)",
-            barmode="group",
-            bargap=0.25,
+            "error (mm), logarithmic",
             xaxis={"type": "category", "nticks": 30},
-            updatemenus=[menu],
-            shapes=[] if tolerance is None else [level_line("y", tolerance)],
+            yaxis={"type": "log", "dtick": "D2"},
+            shapes=lines,
         ),
-        "Error at the tool's origin, pose by pose."
-        + ("" if tolerance is None else f" Dashed: tolerance, {number(tolerance)} mm."),
-        "Bars: error of each pose before and after calibration",
+        f"Error at the tool's origin, pose by pose.{told} Click a pose to see it in all plots, rows and images.",
+        "Error of each pose before and after calibration",
     )
 
 
-def _bar(x: list[str], y: Array, name: str, colour: str) -> dict[str, object]:
-    # several points of one pose follow one another: each gets a bar of its own place
-    x = x if len(x) == len(y) else [str(i + 1) for i in range(len(y))]
+def _dots(x: list[str], y: Array, name: str, colour: str, rows: Rows) -> dict[str, object]:
     return trace(
-        "bar",
+        "scatter markers",
         (x, rounded(y)),
         name,
-        marker={"color": colour},
-        hovertemplate="%{x}: %{y:.3f} mm<extra>" + name + "</extra>",
+        marker={"color": colour, "size": 9},
+        customdata=linked(rows, len(x)),
+        hovertemplate="%{x}: %{y:.3g} mm<extra>" + name + "</extra>",
     )
 
 
-def _histogram(v: Verification) -> Figure:
+def _histogram(v: Verification, rows: Rows) -> Figure:
     groups = [("after", v.errors, AFTER)]
     if v.nominal_errors is not None:
         groups.insert(0, ("before", v.nominal_errors, BEFORE))
@@ -178,15 +178,21 @@ def _histogram(v: Verification) -> Figure:
     data: list[dict[str, object]] = []
     for k, tool in enumerate(v.errors):
         for name, errors, colour in groups:
-            counts, _ = np.histogram(np.clip(errors[tool] * 1000, edges[0], edges[-1]), edges)
+            shown = np.clip(errors[tool] * 1000, edges[0], edges[-1])
+            counts, _ = np.histogram(shown, edges)
+            inside = np.clip(np.searchsorted(edges, shown, side="right") - 1, 0, len(edges) - 2)
+            poses = linked(rows, len(shown))
             data.append(
                 trace(
                     "bar",
                     (rounded(np.sqrt(edges[1:] * edges[:-1])), counts.tolist()),
                     f"{name}, {_tool(tool, v)}",
                     width=rounded(np.diff(edges)),
-                    marker={"color": colour, "opacity": 0.8, "line": {"width": 0.5, "color": "#fff"}},
+                    marker={"color": colour, "opacity": 0.8, "line": {"width": 0.5, "color": PAPER}},
                     visible=True if k == 0 else "legendonly",
+                    customdata=[[poses[i] for i in np.flatnonzero(inside == b)] for b in range(len(counts))]
+                    if poses
+                    else [],
                 )
             )
     more = "; other tool points by a click in the legend" if len(v.errors) > 1 else ""
@@ -201,6 +207,33 @@ def _histogram(v: Verification) -> Figure:
         f"Distribution of the errors{more}.",
         "Histogram of pose errors before and after calibration",
         height=320,
+    )
+
+
+def _pose_table(v: Verification, names: list[str], rows: Rows) -> Table | Text:
+    """The poses, the largest error first."""
+    size = v.errors["0"] * 1000
+    if len(size) != len(names):
+        return Text("")
+    before = None if v.nominal_errors is None else v.nominal_errors["0"] * 1000
+    normalised = np.sqrt(v.normalised)
+    order = [int(i) for i in np.argsort(-size, kind="stable")]
+    cells = [
+        [
+            names[i],
+            "–" if before is None else number(before[i]),
+            number(size[i]),
+            number(1e3 * v.predicted[i]),
+            number(normalised[i], 2),
+        ]
+        for i in order
+    ]
+    return table(
+        ["Pose", "Error before (mm)", "after", "Predicted sigma of the place (mm)", "Error / predicted"],
+        cells,
+        "The poses kept out, the largest error first. Choose one to see it in all plots and images.",
+        shown=8,
+        poses=[int(rows[i]) for i in order],
     )
 
 
@@ -227,7 +260,7 @@ def _iso(v: Verification) -> Table:
     )
 
 
-def _calibration_of_uncertainty(v: Verification, names: list[str]) -> Figure:
+def _calibration_of_uncertainty(v: Verification, names: list[str], rows: Rows) -> Figure:
     size = np.sqrt(v.normalised)
     x = [label(n) for n in names] if len(names) == len(size) else list(range(len(size)))
     data = [
@@ -236,6 +269,7 @@ def _calibration_of_uncertainty(v: Verification, names: list[str]) -> Figure:
             (x, rounded(size)),
             "pose",
             marker={"color": AFTER, "size": 8},
+            customdata=linked(rows, len(size)),
             hovertemplate="%{x}: %{y:.2f}<extra></extra>",
         )
     ]

@@ -25,6 +25,7 @@ from robcal.files.residual_table import residual_columns
 from robcal.files.robot_file import write_robot
 from robcal.files.tables import write_table
 from robcal.recipe.agreement import disagreements
+from robcal.recipe.identification import Identification
 from robcal.recipe.instruments import leading_identification, telling_verification, verify_instruments
 from robcal.recipe.noise import noise_of
 from robcal.recipe.verdict import robot_facts
@@ -38,11 +39,10 @@ def work(context: Context) -> Outcome:
     """Verify on the kept-out poses, or by folds where there are none; write the calibrated robot."""
     campaign, run = context.campaign, context.run
     robot, poses = require_robot(campaign)
-    identification = run.load(artifacts.IDENTIFICATION)
+    identification, delivered = _before(run)
     calibrated = load_calibrated(run)
     diagnosed = run.record("diagnose") is not None
     placed = run.find(artifacts.PLACED) if diagnosed else None
-    delivered = run.find(artifacts.DELIVERED) if diagnosed else None
     options = options_of(campaign, identification.recording.stated)
     instruments = instruments_in_force(run)
     if instruments is not None:
@@ -91,6 +91,14 @@ def work(context: Context) -> Outcome:
     return Outcome(result, outputs, [*notes, *noise.notes])
 
 
+def _before(run: Run) -> tuple[Identification, RobotVerification | None]:
+    """What the robot is verified against, and its verification where a diagnosis has made it already."""
+    adjusted = run.find(artifacts.ADJUSTED)
+    if adjusted is not None:  # the frames, too, are those of the cameras as adjusted
+        return adjusted.identification, None
+    return run.load(artifacts.IDENTIFICATION), run.find(artifacts.DELIVERED)
+
+
 def doubtful_coordinates(run: Run) -> list[str]:
     """What the surveys say against the coordinates that were given."""
     record = run.record("survey")
@@ -136,6 +144,6 @@ STAGE = Stage(
     work=work,
     inputs=no_files,
     settings=lambda campaign: [campaign.name, campaign.entry.model_dump(include={"model", "tolerance_mm"})],
-    after=("identify", "diagnose"),
+    after=("identify", "diagnose", "adjust"),
     module=__name__,
 )

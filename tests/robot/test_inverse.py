@@ -26,6 +26,7 @@ METHODS = {
     "irb120_like": "spherical wrist",
     "ur10": "parallel arm",
     "scara_600": "numeric",
+    "palletiser": "numeric",
     "kr150_class_on_track": "spherical wrist on a track",
 }
 MODELS = {name: read_robot(CONFIGS / f"{name}.yaml") for name in ROBOTS}

@@ -17,7 +17,7 @@ from robcal.diagnosis.core.recording import Recording
 from robcal.diagnosis.gain.heldout import folds, rms
 from robcal.diagnosis.scan.statistics import log_f_probability
 from robcal.diagnosis.scan.tangents import Tangents, tangents
-from robcal.diagnosis.search.shared_curve import Likeness, joined, maker, pattern, refined
+from robcal.diagnosis.search.shared_curve import Likeness, maker, pattern, refined, seats
 from robcal.physics.angle_error_curve import Placed, beside_shared, periodic_curve
 from robcal.physics.cause import Array, LinearCause, RobotCause
 from robcal.physics.site import Joint, RobotSite
@@ -43,6 +43,9 @@ OWN_SIZES = (0.3, 0.6, 0.1)
 """Sizes, in those of a curve, of what joints that share one may differ by; the kept-out poses choose."""
 HELD_PARTS = 20
 """Bumps in one expression of a curve that is held."""
+LEAST_JOINING = 20.0
+"""Deviance of kept-out poses by which a shared curve must predict them better: twice the logarithm of the 480 turns and
+senses that are tried, and as much as decisive evidence (Kass and Raftery, 1995)."""
 LEAST_SHARED = 2
 """Joints that must have a curve in common."""
 SEVERAL = 2
@@ -162,13 +165,18 @@ def _accepted(present: Fit, causes: Sequence[RobotCause], columns: Sequence[Arra
 
 @dataclass(frozen=True)
 class _Shared:
-    """A pattern with its curve on trial: sum of squares at kept-out poses, size of what joints differ by."""
+    """A pattern with its curve on trial: deviance of each kept-out fold, size of what joints differ by."""
 
-    kept_out: float
+    deviance: Array
     size: float
     placed: tuple[Placed, ...]
     cause: RobotCause
     columns: tuple[Array, ...]
+
+    @property
+    def total(self) -> float:
+        """Deviance of all folds."""
+        return float(self.deviance.sum())
 
 
 def _with_shared(
@@ -183,23 +191,51 @@ def _with_shared(
         return _solve(group.present, columns)
 
     placed = refined(placed, make, group.at, solve, _beside(group, placed, OWN_SIZES[0]))
-    found = _tried(group, placed, make, OWN_SIZES[0])
-    for joint in (j for j in joints if j.where not in {p.joint.where for p in placed}):
-        # joints whose own poses show too little of their curve to tell that it is the same
-        others = [c for f, c in zip(group.causes, found.columns[1:], strict=True) if f.where != joint.where]
-        seen = joined(group.present, group.at, found.cause, joint, found.columns[0], others, _solve)
-        if seen is not None:
-            more = (*found.placed, seen)
-            more = refined(more, make, group.at, solve, _beside(group, more, found.size))
-            found = min(found, _tried(group, more, make, found.size), key=lambda t: t.kept_out)
+    found = min((_tried(group, placed, make, size) for size in OWN_SIZES), key=lambda t: t.total)
+    found = _grown(group, found, joints, make, solve)
     trials = [found, *(_tried(group, found.placed, make, size) for size in OWN_SIZES[1:])]
-    found = min(trials, key=lambda t: t.kept_out)
-    alone = _folded(group.present, group.columns, group.label).kept_out(range(len(group.columns)))
-    if found.kept_out > alone:
+    found = min(trials, key=lambda t: t.total)
+    alone = _folded(group.present, group.columns, group.label).deviance(range(len(group.columns)))
+    if not _clear(alone, found.deviance):
         return None
     members = {p.joint.where for p in found.placed}
     causes = [beside_shared(f, found.size) if f.where in members else f for f in group.causes]
     return _accepted(group.present, [found.cause, *causes], found.columns), list(found.columns)
+
+
+def _clear(before: Array, after: Array) -> bool:
+    """Whether deviances (folds,) fall beyond doubt, and in most folds."""
+    return bool(np.sum(before - after) > LEAST_JOINING and 2 * np.sum(after < before) > len(before))
+
+
+def _grown(
+    group: _Group,
+    found: _Shared,
+    joints: Sequence[Joint],
+    make: Callable[[Sequence[Placed]], RobotCause],
+    solve: Callable[[Sequence[Array]], list[Array]],
+) -> _Shared:
+    """The pattern with the further joints in which the curve predicts kept-out poses clearly better than their own.
+
+    Their own poses may show too little of their curve to tell that it is the same; with every joint that joins the
+    curve is known better, so those that were left are tried again.
+    """
+    grew = True
+    while grew:
+        grew = False
+        for joint in (j for j in joints if j.where not in {p.joint.where for p in found.placed}):
+            others = [c for f, c in zip(group.causes, found.columns[1:], strict=True) if f.where != joint.where]
+            tried = [
+                _tried(group, (*found.placed, seat), make, found.size)
+                for seat in seats(group.present, group.at, found.cause, joint, found.columns[0], others, _solve)
+            ]
+            best = min(tried, key=lambda t: t.total)
+            if not _clear(found.deviance, best.deviance):
+                continue
+            turned = refined(best.placed, make, group.at, solve, _beside(group, best.placed, best.size))
+            found = min(best, _tried(group, turned, make, best.size), key=lambda t: t.total)
+            grew = True
+    return found
 
 
 def _beside(group: _Group, placed: Sequence[Placed], size: float) -> list[Array]:
@@ -212,7 +248,7 @@ def _tried(group: _Group, placed: tuple[Placed, ...], make: Callable[..., RobotC
     """A pattern beside curves of all joints, those of its members `size` times as large."""
     own, cause = _beside(group, placed, size), make(placed)
     common = group.at.columns(cause, cause.grid[0]) * cause.sizes(cause.grid[0])
-    after = _folded(group.present, [common, *own], group.label).kept_out(range(len(own) + 1))
+    after = _folded(group.present, [common, *own], group.label).deviance(range(len(own) + 1))
     return _Shared(after, size, placed, cause, (common, *own))
 
 
@@ -304,9 +340,14 @@ class _Normals:
 
     def solve(self, variance: float) -> Array:
         """Parameters and amplitudes; the prior weighs as the variance factor says."""
-        ridge = np.full(len(self.right), 1e-9 * np.max(np.diag(self.gram)))
-        ridge[self.fitted :] = variance
-        return np.linalg.solve(self.gram + np.diag(ridge), self.right)
+        return np.linalg.solve(self.gram + np.diag(_ridge(self.gram, self.fitted, variance)), self.right)
+
+
+def _ridge(gram: Array, fitted: int, variance: float) -> Array:
+    """What is added to the diagonal of normal equations: next to nothing for fitted parameters, a unit prior else."""
+    ridge = np.full(len(gram), 1e-9 * np.max(np.diag(gram)))
+    ridge[fitted:] = variance
+    return ridge
 
 
 def _scaled(present: Fit) -> Array:
@@ -318,18 +359,45 @@ def _scaled(present: Fit) -> Array:
 class _Folded:
     """Normal equations of each fold, and in them the places of the fitted parameters and of each joint's columns."""
 
-    folds: tuple[tuple[Array, Array, float], ...]
+    folds: tuple[tuple[Array, Array, float, int], ...]
     ends: Array
     variance: float
 
+    def _at(self, joints: Iterable[int]) -> Array:
+        fitted = np.arange(int(self.ends[0]))
+        return np.concatenate([fitted, *(np.arange(self.ends[k], self.ends[k + 1]) for k in joints)])
+
+    def deviance(self, joints: Iterable[int]) -> Array:
+        """Minus twice the logarithm of the predictive density (folds,) of each fold's residuals given the others', with
+        the curves of the given joints.
+
+        Unlike their sum of squares it weighs what a block shows by how well the other blocks determine it: one that
+        reaches where no other was says little of which model is right.
+        """
+        fitted, at = int(self.ends[0]), self._at(joints)
+        parts = [(N[np.ix_(at, at)], b[at], square, count) for N, b, square, count in self.folds]
+        gram, right = np.sum([part[0] for part in parts], axis=0), np.sum([part[1] for part in parts], axis=0)
+        square, ridge = sum(part[2] for part in parts), _ridge(gram, fitted, self.variance)
+
+        def evidence(N: Array, b: Array, total: float) -> float:
+            L = np.linalg.cholesky(N + np.diag(ridge))
+            white = np.linalg.solve(L, b)
+            return (total - float(white @ white)) / self.variance + 2.0 * float(np.sum(np.log(np.diag(L))))
+
+        whole = evidence(gram, right, square)
+        out = [
+            whole - evidence(gram - N, right - b, square - own) + count * np.log(self.variance)
+            for N, b, own, count in parts
+        ]
+        return np.array(out)
+
     def kept_out(self, joints: Iterable[int]) -> float:
         """sum of squares of the residuals that the other folds predict with the curves of the given joints."""
-        fitted = int(self.ends[0])
-        at = np.concatenate([np.arange(fitted), *(np.arange(self.ends[k], self.ends[k + 1]) for k in joints)])
+        fitted, at = int(self.ends[0]), self._at(joints)
         gram = np.sum([f[0] for f in self.folds], axis=0)[np.ix_(at, at)]
         right = np.sum([f[1] for f in self.folds], axis=0)[at]
         total = 0.0
-        for N, b, square in self.folds:
+        for N, b, square, _ in self.folds:
             here, own = N[np.ix_(at, at)], b[at]
             x = _Normals(gram - here, right - own, fitted).solve(self.variance)
             total += square - 2.0 * float(x @ own) + float(x @ here @ x)
@@ -342,7 +410,7 @@ def _folded(present: Fit, columns: Sequence[Array], label: Array) -> _Folded:
     folds = []
     for fold in np.unique(label):
         A, b = X[label == fold], r[label == fold]
-        folds.append((A.T @ A, A.T @ b, float(b @ b)))
+        folds.append((A.T @ A, A.T @ b, float(b @ b), len(b)))
     ends = np.cumsum([fitted.shape[1], *(c.shape[1] for c in columns)])
     gram, right = np.sum([f[0] for f in folds], axis=0), np.sum([f[1] for f in folds], axis=0)
     return _Folded(tuple(folds), ends, _variance(present, X, gram, right, fitted.shape[1]))

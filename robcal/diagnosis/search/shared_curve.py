@@ -23,8 +23,8 @@ TURNS, TABLE = 240, 1441
 """Turns that are tried, and points of the curve's table."""
 ELSEWHERE = np.deg2rad(8.0)
 """Turns farther apart than this are different answers."""
-BEYOND_DOUBT = 1.5
-"""Factor by which the best turn must explain more than any other."""
+SEATS = 4
+"""Turns of a further joint that are tried on kept-out poses."""
 STEP = 1e-4
 """rad, over which a curve is differentiated."""
 LARGEST_TURN = 0.05
@@ -95,7 +95,7 @@ def refined(
     return placed
 
 
-def joined(
+def seats(
     present: Fit,
     at: Tangents,
     cause: RobotCause,
@@ -103,14 +103,15 @@ def joined(
     common: Array,
     others: Sequence[Array],
     solve: Callable[[Fit, Sequence[Array]], list[Array]],
-) -> Placed | None:
-    """How the curve that other joints share sits in one more joint: the turn and sense that explain most there, if no
-    other explains nearly as much.
+) -> tuple[Placed, ...]:
+    """How the curve that other joints share may sit in one more joint: the turns and senses that explain most there.
 
     Parameters
     ----------
     cause, common : the shared curve and its scaled columns. others : scaled columns of all other curves but the
         joint's own.
+
+    Weakness: none of them need be right; poses kept out have to choose.
     """
     columns = [common, *others]
     values = solve(present, columns)
@@ -131,14 +132,18 @@ def joined(
             along = np.clip(left @ trial, 0.0, None)
             gains.append(along**2 / np.maximum(np.sum(trial**2, axis=0), 1e-300))
     gain = np.concatenate(gains)
-    best = int(np.argmax(gain))
-    away = np.abs((turns - turns[best % TURNS] + np.pi) % (2.0 * np.pi) - np.pi) > ELSEWHERE
-    rivals = np.concatenate([away, away])
-    rivals[:TURNS] |= best >= TURNS
-    rivals[TURNS:] |= best < TURNS
-    if gain[best] < BEYOND_DOUBT * np.max(gain[rivals]):
-        return None
-    return Placed(joint, 1 if best < TURNS else -1, float(turns[best % TURNS]))
+    found: list[Placed] = []
+    for k in np.argsort(-gain):
+        seat = Placed(joint, 1 if k < TURNS else -1, float(turns[k % TURNS]))
+        if all(seat.sense != other.sense or _apart(seat, other) > ELSEWHERE for other in found):
+            found.append(seat)
+        if len(found) == SEATS:
+            break
+    return tuple(found)
+
+
+def _apart(one: Placed, other: Placed) -> float:
+    return float(np.abs((one.shift - other.shift + np.pi) % (2.0 * np.pi) - np.pi))
 
 
 def _slope(

@@ -8,8 +8,8 @@ import numpy as np
 from robcal.errors import InvalidInput
 from robcal.photogrammetry.core.bodies import Body, IntArray
 from robcal.photogrammetry.core.camera import Camera
-from robcal.photogrammetry.station.adjustment import Prior, interior_prior
-from robcal.photogrammetry.station.network import GROUPS, MarkTable, StationMarks, StationSettings, Unknowns
+from robcal.photogrammetry.station.adjustment import interior_prior
+from robcal.photogrammetry.station.network import GROUPS, MarkTable, Prior, StationMarks, StationSettings, Unknowns
 from robcal.photogrammetry.station.start import ImageStart
 from robcal.photogrammetry.station.state import StationState
 from robcal.transforms import Array
