@@ -64,7 +64,7 @@ def read_reseau(path: Path) -> tuple[Reseau, tuple[Path, ...]]:
         )
     y, x = np.mgrid[: entry.rows, : entry.columns] * (entry.pitch_mm / 1000.0)
     places = np.stack([x, y], axis=-1)
-    files = (path,)
+    files: tuple[Path, ...] = (path,)
     if entry.crosses is not None:
         table = path.parent / entry.crosses
         places = _calibrated(table, places, entry.pitch_mm / 1000.0)
@@ -122,13 +122,17 @@ def read_tiles(path: Path) -> tuple[TileFile, ...]:
     table.unique(["file"])
     names = table.texts("file")
     grids = table.texts("grid") if table.has("grid") else names
-    for cells in (names, grids):
-        table.refuse(
-            [Path(name).suffix.lower() not in SUFFIXES or not (path.parent / name).is_file() for name in cells],
-            lambda i, cells=cells: f"{cells[i]} is no image beside this list: copy it there or remove the row",
-        )
+    absent = [[n for n in pair if not _is_image(path.parent / n)] for pair in zip(names, grids, strict=True)]
+    table.refuse(
+        [bool(wrong) for wrong in absent],
+        lambda i: f"{absent[i][0]} is no image beside this list: copy it there or remove the row",
+    )
     centre = np.column_stack([table.numbers("x_mm"), table.numbers("y_mm")]) / 1000.0
     return tuple(
         TileFile(path.parent / name, path.parent / grid, place, int(row))
         for name, grid, place, row in zip(names, grids, centre, table.rows, strict=True)
     )
+
+
+def _is_image(path: Path) -> bool:
+    return path.suffix.lower() in SUFFIXES and path.is_file()

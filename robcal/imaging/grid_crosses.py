@@ -152,7 +152,9 @@ def _fit(image: Array, places: NDArray[np.int64], size: CrossSize) -> Crosses:
     return _clean(solved.state, value, places, x, y, half, size)
 
 
-def _clean(p: Array, value: Array, places: Array, x: Array, y: Array, half: int, size: CrossSize) -> Crosses:
+def _clean(
+    p: Array, value: Array, places: NDArray[np.int64], x: Array, y: Array, half: int, size: CrossSize
+) -> Crosses:
     grey, J = cross_values(p, x, y, float(half))
     variance = ((value - grey) ** 2).sum(axis=1) / (len(x) - PARAMETERS)
     normal = np.swapaxes(J, 1, 2) @ J

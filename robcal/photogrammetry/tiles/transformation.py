@@ -88,9 +88,9 @@ class TileOrientation:
         matrix = np.empty((len(xy), 2, 2))
         matrix[:, 0, 0], matrix[:, 0, 1] = h[0] - xy[:, 0] * h[6], h[1] - xy[:, 0] * h[7]
         matrix[:, 1, 0], matrix[:, 1, 1] = h[3] - xy[:, 1] * h[6], h[4] - xy[:, 1] * h[7]
-        X = np.linalg.solve(matrix, (xy - h[[2, 5]])[..., None])[..., 0]
+        X: Array = np.linalg.solve(matrix, (xy - h[[2, 5]])[..., None])[..., 0]
         _, by_place, by_h = _project(h, X)
-        by_xy = np.linalg.inv(by_place)
+        by_xy: Array = np.linalg.inv(by_place)
         return X + self.origin, by_xy, -by_xy @ by_h
 
 
@@ -131,7 +131,7 @@ def orient_tile(crosses: Crosses, reseau: Reseau, centre: Array, shape: tuple[in
     kind, best = "affine", affine
     if np.count_nonzero(used) > LEAST_CROSSES:
         projective = _adjust(place, crosses.xy, covariance, used, PROJECTIVE)
-        redundancy = 2 * np.count_nonzero(used) - PROJECTIVE
+        redundancy = 2 * int(np.count_nonzero(used)) - PROJECTIVE
         gain = (affine[2] - projective[2]) / 2.0 / max(projective[2] / redundancy, 1e-300)
         if stats.f.sf(gain, 2, redundancy) < LEVEL:
             kind, best = "projective", projective
@@ -144,9 +144,11 @@ def orient_tile(crosses: Crosses, reseau: Reseau, centre: Array, shape: tuple[in
     rms = float(np.sqrt(np.mean((crosses.xy - _project(h, place)[0])[used] ** 2)))
     if rms > MOST_MISSED:
         raise DegenerateGeometry(f"its crosses miss the grid by {rms:.3g} px")
-    factor = max(1.0, cost / max(2 * np.count_nonzero(used) - (6 if kind == "affine" else 8), 1))
+    count = int(np.count_nonzero(used))
+    redundancy = max(2 * count - (AFFINE if kind == "affine" else PROJECTIVE), 1)
+    factor = max(1.0, cost / redundancy)
     seen = _within(reseau, near, h, shape)
-    return TileOrientation(h, factor * C, near, kind, int(used.sum()), max(0, seen - int(used.sum())), rms)
+    return TileOrientation(h, factor * C, near, kind, count, max(0, seen - count), rms)
 
 
 def _assign(offset: Array, reseau: Reseau, near: Array) -> tuple[IntArray, IntArray]:
