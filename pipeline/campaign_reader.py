@@ -19,6 +19,7 @@ from robcal.errors import InvalidInput, RobcalError
 from robcal.files.body_file import check_ring_codes, read_body
 from robcal.files.camera_file import read_camera
 from robcal.files.camera_import import split_choice
+from robcal.files.commanded import at_own_angles, commanded_angles
 from robcal.files.flange_poses import read_flange_poses
 from robcal.files.foreign_tables import read_mapped_table
 from robcal.files.images import list_images
@@ -178,6 +179,8 @@ class _Reader:
             poses = poses_from_images(self.path, cameras)
         measurements = self._tables(entry.measurements, robot, poses, bodies)
         instruments = self._part(partial(self._instruments, measurements, robot, poses, bodies)) or {}
+        if poses is not None and not self.faults:
+            poses, measurements, instruments = self._at_own_angles(poses, measurements, instruments)
         return Campaign(
             path=self.path,
             entry=entry,
@@ -204,7 +207,7 @@ class _Reader:
             places = forward(chain_of(robot), poses.q)[:, :3, 3]
 
         def read(use: TableUse, table: Table) -> MeasuredTable:
-            found = self._measurements(use, table, known if sound else self.pose_names)
+            found = self._measurements(use, table, known if sound else self.pose_names, robot)
             found = found if places is None else without_frozen(found, places, known)
             self._check_targets(table, found, bodies)
             return found
@@ -215,9 +218,11 @@ class _Reader:
             self.warnings.extend(table.notes)
         return tables
 
-    def _measurements(self, use: TableUse, table: Table, names: Sequence[str]) -> MeasuredTable:
+    def _measurements(
+        self, use: TableUse, table: Table, names: Sequence[str], robot: RobotModel | None
+    ) -> MeasuredTable:
         if use.line_cameras is None:
-            return measurements_of(table, names)
+            return measurements_of(table, names, q=commanded_angles(table, robot))
         path = self._file(use.line_cameras)
         return replace(measured_lights(table, names, read_line_cameras(path)), sources=(path,))
 
@@ -261,6 +266,29 @@ class _Reader:
             name: InstrumentSource(found, entry.instruments.get(name), worlds[name], tools[name])
             for name, found in tables.items()
         }
+
+    def _at_own_angles(
+        self, poses: Poses, measurements: tuple[MeasuredTable, ...], instruments: dict[str, InstrumentSource]
+    ) -> tuple[Poses, tuple[MeasuredTable, ...], dict[str, InstrumentSource]]:
+        """Every reading at the joint angles that its row states, where they are not those of its pose."""
+        known = {id(t): t for t in (*measurements, *(t for i in instruments.values() for t in i.tables or ()))}
+        log, made = at_own_angles(poses, list(known.values()))
+        if log is poses:
+            return poses, measurements, instruments
+        if self.entry.station is not None or self.entry.hand_eye is not None:
+            raise self._error(
+                ("poses",),
+                "tables of measurements state other joint angles than those of their poses, which have images as well: "
+                "give these readings poses of their own",
+            )
+        self.notes.append(f"readings at joint angles of their own: {len(log)} poses in place of {len(poses)}")
+        new = dict(zip(known, made, strict=True))
+
+        def at(tables: tuple[MeasuredTable, ...]) -> tuple[MeasuredTable, ...]:
+            return tuple(new[id(t)] for t in tables)
+
+        sources = {n: i if i.tables is None else replace(i, tables=at(i.tables)) for n, i in instruments.items()}
+        return log, at(measurements), sources
 
     def _check_priors(self, robot: RobotModel) -> None:
         try:
