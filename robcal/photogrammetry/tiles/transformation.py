@@ -88,9 +88,9 @@ class TileOrientation:
         matrix = np.empty((len(xy), 2, 2))
         matrix[:, 0, 0], matrix[:, 0, 1] = h[0] - xy[:, 0] * h[6], h[1] - xy[:, 0] * h[7]
         matrix[:, 1, 0], matrix[:, 1, 1] = h[3] - xy[:, 1] * h[6], h[4] - xy[:, 1] * h[7]
-        X: Array = np.linalg.solve(matrix, (xy - h[[2, 5]])[..., None])[..., 0]
+        X = np.asarray(np.linalg.solve(matrix, (xy - h[[2, 5]])[..., None])[..., 0], dtype=float)
         _, by_place, by_h = _project(h, X)
-        by_xy: Array = np.linalg.inv(by_place)
+        by_xy = np.asarray(np.linalg.inv(by_place), dtype=float)
         return X + self.origin, by_xy, -by_xy @ by_h
 
 
