@@ -14,8 +14,6 @@ Truth: 500 new poses, in the world of the first camera as it really stands. `err
 freedom. Records are appended to ``--out`` and not run again.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import logging
