@@ -1,7 +1,5 @@
 """A page with the whole history of a drift control: one self-contained HTML file."""
 
-from __future__ import annotations
-
 import html
 import json
 from collections.abc import Sequence

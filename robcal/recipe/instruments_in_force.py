@@ -5,8 +5,6 @@ in which robot, worlds, tools and wires are fitted anew, to first order; a stop 
 saw lies in one fold.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property

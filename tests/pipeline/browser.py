@@ -1,7 +1,5 @@
 """Pages in Chromium, headless."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import time

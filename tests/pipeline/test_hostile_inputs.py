@@ -1,7 +1,5 @@
 """What an adversary, or another operating system, puts into a campaign: through the commands, one sentence, no harm."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import struct

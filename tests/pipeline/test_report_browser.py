@@ -1,7 +1,5 @@
 """The report in Chromium, headless: no error, every plot drawn, no request."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 
