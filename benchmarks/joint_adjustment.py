@@ -14,8 +14,6 @@ scattering; NEES the squared normalised error per degree of freedom. Records are
 again.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import logging

@@ -10,8 +10,6 @@ run has seen (variant ``dropped`` and ``random``: poses that were taken out of t
 Usage: ``python -m benchmarks.real_splits CAMPAIGN ... [--variants NAME ...] [--seed N] [--keep FOLDER]``.
 """
 
-from __future__ import annotations
-
 import argparse
 import csv
 import json

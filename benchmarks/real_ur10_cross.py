@@ -8,8 +8,6 @@ other poses. A second table tells the turns, and what is left.
 Usage: ``python -m benchmarks.real_ur10_cross FOLDER [--picture FILE]``; FOLDER as for :mod:`benchmarks.real_ur10`.
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -28,6 +28,7 @@ from robcal.files.laser_sensor import read_sensor, sensed_points
 from robcal.files.line_cameras import measured_lights, read_line_cameras
 from robcal.files.measurement_tables import MeasuredTable, check_marks, marks_of, measurements_of, without_frozen
 from robcal.files.poses_table import Poses, check_rows, poses_of
+from robcal.files.reseau_file import list_tiled, read_reseau
 from robcal.files.robot_import import read_any_robot
 from robcal.files.schemas import parse, parse_leniently, proposal
 from robcal.files.tables import FaultyRows, Table, read_table
@@ -377,6 +378,8 @@ class _Reader:
     def _source(
         self, entry: SurveyEntry | StationCameraEntry, camera: str | None, place: tuple[str | int, ...], what: str
     ) -> ImageSource:
+        if entry.tiles is not None and entry.images is None:
+            raise self._error((*place, "tiles"), f"'tiles' of {what} needs 'images': a folder of lists of tiles")
         if (entry.images is None) == (entry.observations is None):
             raise self._error(place, f"{what} needs either 'images' (a folder) or 'observations' (a CSV file)")
         start, start_path = None, None
@@ -391,7 +394,19 @@ class _Reader:
             check_marks(marks, size)
             return ImageSource({}, marks, start, start_path, size)
         folder = self._place(str(entry.images)).absolute()  # the report looks for them from anywhere
-        return ImageSource(list_images(folder, what), None, start, start_path, size)
+        if entry.tiles is None:
+            return ImageSource(list_images(folder, what), None, start, start_path, size)
+        reseau, files = read_reseau(self._place(entry.tiles))
+        self.files.extend(files)
+        whole = (reseau.shape[1], reseau.shape[0])
+        if size not in (None, whole):
+            where = start_path or self.path
+            raise InvalidInput(
+                f"{where}: {size[0] if size else 0} x {size[1] if size else 0} px, but the mosaic of "
+                f"{files[0].name} has {whole[0]} x {whole[1]}: calibrate the "
+                "mosaic itself, one pitch around the grid included"
+            )
+        return ImageSource(list_tiled(folder, what), None, start, start_path, whole, reseau, files)
 
     def _station(self, poses: Poses | None) -> dict[str, ImageSource]:
         station = self.entry.station

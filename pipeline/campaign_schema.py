@@ -64,9 +64,13 @@ class FixedDatum(Entry):
 
 
 class SurveyEntry(Entry):
-    """A free-hand image set of a body, or marks measured by another program."""
+    """A free-hand image set of a body, or marks measured by another program.
+
+    With ``tiles`` (a grid file) ``images`` holds lists of tiles.
+    """
 
     images: Text | None = None
+    tiles: Text | None = None
     observations: Text | None = None
     camera: Text | None = None
     size_px: tuple[Whole, Whole] | None = None
@@ -89,9 +93,10 @@ class BodyUse(Entry):
 
 
 class StationCameraEntry(Entry):
-    """A camera that watches the robot."""
+    """A camera that watches the robot; with ``tiles`` (a grid file) ``images`` holds lists of tiles."""
 
     images: Text | None = None
+    tiles: Text | None = None
     observations: Text | None = None
     calibration: Text | None = None
     size_px: tuple[Whole, Whole] | None = None

@@ -16,10 +16,10 @@ from robcal.calibration.instruments import IdentifiedInstruments
 from robcal.calibration.instruments.linearised import LinearInstruments, linearised
 from robcal.calibration.joint_log import JointLog
 from robcal.calibration.wire import LIMITS
-from robcal.diagnosis.core.fitting import solve
 from robcal.diagnosis.core.recording import Recording, observation_data
 from robcal.diagnosis.core.result import Finding
 from robcal.estimation.covariance import cofactor
+from robcal.estimation.minimum_norm import solve
 from robcal.physics.cause import DEVIATION, numeric_sigma
 from robcal.physics.measuring import WIRE_SCALE, measuring_causes
 from robcal.robot.kernel_cache import kernel_of

@@ -1,7 +1,5 @@
 """Irregular error curves of joints: found, alike where they are, and not taken for what has a name."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Evidence of causes over their grids."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Joint adjustment: exact derivatives, a robot whose covariance holds in the cameras' world, faults told."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path

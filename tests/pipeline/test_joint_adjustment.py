@@ -1,7 +1,5 @@
 """`model: {adjustment: joint}` in a run: results, the way back, refusals."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Readings that state their own joint angles are at these, whatever the table of poses says."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -4,8 +4,6 @@ What the curves of single joints say of each other starts it; turns then follow 
 steps. Joints that differ keep a curve of what they differ by, whose size the kept-out poses choose.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
