@@ -24,6 +24,7 @@ from robcal.files.flange_poses import read_flange_poses
 from robcal.files.foreign_tables import read_mapped_table
 from robcal.files.images import list_images
 from robcal.files.joint_logs import is_joint_log, log_of_robot, read_controller_log
+from robcal.files.laser_sensor import read_sensor, sensed_points
 from robcal.files.line_cameras import measured_lights, read_line_cameras
 from robcal.files.measurement_tables import MeasuredTable, check_marks, marks_of, measurements_of, without_frozen
 from robcal.files.poses_table import Poses, check_rows, poses_of
@@ -221,6 +222,11 @@ class _Reader:
     def _measurements(
         self, use: TableUse, table: Table, names: Sequence[str], robot: RobotModel | None
     ) -> MeasuredTable:
+        if use.sensor is not None:
+            path = self._file(use.sensor)
+            return replace(
+                sensed_points(table, names, read_sensor(path), commanded_angles(table, robot)), sources=(path,)
+            )
         if use.line_cameras is None:
             return measurements_of(table, names, q=commanded_angles(table, robot))
         path = self._file(use.line_cameras)
