@@ -9,7 +9,9 @@ from robcal.calibration.observations import FrameObservations
 from robcal.diagnosis.core.fitting import Accepted, Fit, fit, terms_of
 from robcal.diagnosis.core.recording import Recording
 from robcal.diagnosis.diagnose import diagnose
-from robcal.diagnosis.search.curves import LEAST_POSES, _Folded, find_curves, frozen_terms, likenesses, nested_errors
+from robcal.diagnosis.search.curves import LEAST_POSES, find_curves, frozen_terms, nested_errors
+from robcal.diagnosis.search.folded_normals import Folded
+from robcal.diagnosis.search.likeness import likenesses
 from robcal.physics.angle_error_curve import periodic_curve
 from robcal.physics.site import Joint
 from robcal.robot.kernel import Kernel
@@ -90,7 +92,7 @@ def test_blocks_weigh_by_what_the_others_tell_of_them() -> None:
     r = X @ np.array([1.0, -2.0, 1.5, -0.5, 3.0]) + rng.normal(size=60)
     blocks = [(A.T @ A, A.T @ b, float(b @ b), len(b)) for k in range(4) for A, b in [(X[label == k], r[label == k])]]
     variance = 1.3
-    found = _Folded(tuple(blocks), np.array([2, 5]), variance).deviance([0])
+    found = Folded(tuple(blocks), np.array([2, 5]), variance).deviance([0])
     ridge = np.concatenate([np.full(2, 1e-9 * np.max(np.diag(X.T @ X))), np.full(3, variance)])
     for k in range(4):
         A, b, test = X[label != k], r[label != k], X[label == k]

@@ -15,7 +15,7 @@ from robcal.diagnosis.core.result import Diagnosis
 from robcal.diagnosis.diagnose import diagnose
 from robcal.diagnosis.findings import rescaled
 from robcal.physics.cause import LinearCause
-from robcal.physics.joint import COUNTERBALANCE
+from robcal.physics.joint_load import COUNTERBALANCE
 from robcal.recipe.robot_diagnosis import own_elasticities
 from robcal.transforms import exp_so3
 from tests.diagnosis.recordings import concealed

@@ -5,7 +5,7 @@ steps. Joints that differ keep a curve of what they differ by, whose size the ke
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -27,41 +27,6 @@ STEP = 1e-4
 """rad, over which a curve is differentiated."""
 LARGEST_TURN = 0.05
 """rad: largest step of a turn; the finest waves of a curve are a few times as long."""
-
-
-@dataclass(frozen=True)
-class Likeness:
-    """A joint whose curve is that of another: `joint(q) = sense * other(sense * q + shift)`.
-
-    Attributes
-    ----------
-    joint, other : a joint and an earlier one that has the same curve. shift : rad.
-    sense : -1 for a part mounted the other way round.
-    correlation : of the two curves where both are known. overlap : rad.
-    """
-
-    joint: str
-    other: str
-    sense: int
-    shift: float
-    correlation: float
-    overlap: float
-
-
-def pattern(joints: Sequence[Joint], likenesses: Sequence[Likeness]) -> tuple[Placed, ...]:
-    """The largest group of joints (in their order) whose curves are alike, the first of them as reference."""
-    groups: list[dict[str, Placed]] = []
-    by_name = {joint.where: joint for joint in joints}
-    for like in likenesses:
-        group = next((g for g in groups if like.other in g), None)
-        if group is None:
-            group = {like.other: Placed(by_name[like.other])}
-            groups.append(group)
-        other = group[like.other]
-        # sense (other.sense c(other.sense (sense q + shift) + other.shift))
-        shift = float((other.sense * like.shift + other.shift) % (2.0 * np.pi))
-        group[like.joint] = Placed(by_name[like.joint], like.sense * other.sense, shift)
-    return tuple(max(groups, key=len).values()) if groups else ()
 
 
 def refined(
