@@ -47,7 +47,7 @@ def exchange_robot(reference: Path, campaign_path: Path, out: Path, workers: int
     except (InvalidInput, NotIdentifiable) as error:
         raise located(error, str(campaign.path)) from None
     keep_calibrated(run, found, f"exchanged for {robot.model.name}, from campaign {campaign.name}")
-    joints = {f.name: f"{f.name}.{f.joint_kind}" for f in nominal.joints}
+    joints = {f.name: f.zero_name for f in nominal.joints}
     values, sigma = found.values, dict(zip(found.names, found.sigma, strict=True))
     offsets = {axis: float(np.degrees(values[n])) for axis, n in joints.items() if n in values}
     warnings = [

@@ -26,5 +26,9 @@ def compiled(function: F) -> F:
 
 
 def inner(function: F) -> F:
-    """A function that only compiled ones call: it becomes part of them, and of what they keep on disk."""
-    return cast(F, numba.njit(**_SETTINGS)(function))
+    """A function that only compiled ones call: it becomes part of them, and of what they keep on disk.
+
+    Inlined by force: one left out of line has a second machine code, compiled for itself, which a process that compiles
+    links and a process that loads from disk does not; these two round differently.
+    """
+    return cast(F, numba.njit(forceinline=True, **_SETTINGS)(function))

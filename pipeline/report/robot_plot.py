@@ -30,7 +30,8 @@ def robot_figure(material: Material, causes: list[dict[str, Any]]) -> Figure | N
     data: list[dict[str, Any]] = []
     data.append(_line(stick, "robot", INK, 12))
     data += _triad(tool, 0.08 * size)
-    joints = np.array([motion[k][:3, :3] @ chain.points[k] + motion[k][:3, 3] for k in range(chain.n_joints)])
+    lines = chain.line_of_joint
+    joints = np.array([motion[k][:3, :3] @ chain.points[k] + motion[k][:3, 3] for k in lines])
     data.append(_dots(joints, "joints", AFTER, 7, [f"axis {k + 1}: {n}" for k, n in enumerate(chain.names)]))
     marked = []
     for cause in causes:
@@ -75,13 +76,14 @@ def _place(
     """Centre, direction and name of a place in base coordinates."""
     where, direction, stage = str(cause.get("where")), cause.get("direction"), cause.get("stage")
     if where.startswith("axis") and where[4:].isdigit() and 0 < int(where[4:]) <= chain.n_joints:
-        k = int(where[4:]) - 1
+        joint = int(where[4:]) - 1
+        k = int(chain.line_of_joint[joint])
         centre = motion[k][:3, :3] @ chain.points[k] + motion[k][:3, 3]
-        own = model.joints[k]
+        own = model.joints[joint]
         if direction in _AXIS and direction != own.axis:
             at = [f.name for f in model.frames].index(own.name)
-            return centre, frames[at][:3, _AXIS[direction]], f"axis {k + 1}, direction {direction}"
-        return centre, motion[k][:3, :3] @ chain.axes[k], f"axis {k + 1}"
+            return centre, frames[at][:3, _AXIS[direction]], f"axis {joint + 1}, direction {direction}"
+        return centre, motion[k][:3, :3] @ chain.axes[k], f"axis {joint + 1}"
     if where == "base":
         return np.zeros(3), np.array([0.0, 0.0, 1.0]), "base"
     if stage == "body" or where in model.payloads or where == "tool":

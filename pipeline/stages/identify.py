@@ -4,10 +4,11 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.artifacts import CALIBRATED, DIAGNOSED_INSTRUMENTS, HAND_EYE, IDENTIFICATION, INSTRUMENTS
+from pipeline.artifacts import ADJUSTED, CALIBRATED, DIAGNOSED_INSTRUMENTS, HAND_EYE, IDENTIFICATION, INSTRUMENTS
 from pipeline.bodies import body_for_robot
 from pipeline.campaign import Campaign
 from pipeline.instrument_results import instrument_notes, instruments_result
+from pipeline.model_priors import model_priors
 from pipeline.runs import Run
 from pipeline.stages.base import Context, Outcome, Stage
 from pipeline.stages.observations import build_instruments, build_recording, corrections_of
@@ -48,6 +49,7 @@ def options_of(campaign: Campaign, stated: bool) -> IdentifyOptions:
         objective="basis" if chosen.objective == "basis_norm" else "maximum_likelihood",
         statics=chosen.statics,
         joint_sigma=None if chosen.joint_sigma_deg is None else float(np.radians(chosen.joint_sigma_deg)),
+        priors={} if campaign.robot is None else model_priors(chosen.priors, campaign.robot),
         covariance="auto" if stated else "estimated",
     )
 
@@ -191,7 +193,7 @@ def instruments_in_force(run: Run) -> IdentifiedInstruments | None:
 
 
 def load_calibrated(run: Run, instrument: str | None = None) -> CalibratedRobot:
-    """The robot with all that was found out about it: after the diagnosis where there was one.
+    """The robot with all that was found out about it: after diagnosis and joint adjustment where there were such.
 
     In the world and with the tool of an ``instrument``; of several, by default of the one that tells most.
 
@@ -199,7 +201,8 @@ def load_calibrated(run: Run, instrument: str | None = None) -> CalibratedRobot:
     ------
     InvalidInput : the run has no calibrated robot, or no such instrument.
     """
-    robot: CalibratedRobot | None = run.find(CALIBRATED)
+    adjusted = run.find(ADJUSTED)
+    robot: CalibratedRobot | None = run.find(CALIBRATED) if adjusted is None else adjusted.robot
     identified = run.find(IDENTIFICATION)
     if robot is None and identified is not None:
         robot = identified.robot

@@ -134,7 +134,7 @@ def _frame_of(
         return np.eye(4), -1
     if name == "body":
         T = frames[:, -1] if flange_T_body is None else frames[:, -1] @ flange_T_body
-        return T, chain.n_joints
+        return T, len(chain.axes)
     if name not in names:
         raise InvalidInput(f"a capsule is fixed to '{name}', but the robot's frames are {', '.join(names)}, base, body")
     return frames[:, names[name]], int(chain.moved_by[names[name]])

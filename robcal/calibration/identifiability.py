@@ -15,7 +15,8 @@ from scipy import linalg, special
 
 from robcal.calibration.wire import LIMITS as WIRE_LIMITS
 from robcal.errors import InvalidInput, NotIdentifiable
-from robcal.robot.model import ANGLE_OF_AXIS, ELASTIC_KINDS, GEOMETRIC_KINDS, RobotModel
+from robcal.robot.loops import FOUR_BAR_LENGTHS
+from robcal.robot.model import GEOMETRIC_KINDS, RobotModel, frame_kinds
 from robcal.robot.statics import moment_names
 from robcal.robot.terms import identifier
 
@@ -36,6 +37,8 @@ OWN_AXIS_LEVEL = 0.05
 """An elasticity about the joint's own axis stays unless its F-test gives a p-value above this: it is known to exist."""
 CROSS_AXIS_LEVEL = 0.01
 """One across the axis enters only below this, divided by the number of candidates (Bonferroni)."""
+
+CRANK_FIRST = ("crank_angle", *FOUR_BAR_LENGTHS)
 
 TABLE_5_4 = (
     ("roll", "elastic_roll", "elastic_pitch"),
@@ -79,11 +82,15 @@ def choose_candidates(model: RobotModel, parameters: str | Sequence[str]) -> Can
     InvalidInput : unknown choice or name, or Table 5.4 for another kind of arm.
     """
     ends = [f"{end}.{k}" for end in ("base", "tool") for k in GEOMETRIC_KINDS]
-    zeros = [f"{f.name}.{f.joint_kind}" for f in model.joints]
-    others = [f"{f.name}.{k}" for f in model.frames for k in GEOMETRIC_KINDS if f"{f.name}.{k}" not in zeros]
+    zeros = [f.zero_name for f in model.joints]
+    others = [f"{f.name}.{k}" for f in model.frames for k in GEOMETRIC_KINDS]
+    # of a four-bar only the ratios of its lengths show: the ground, which comes last, stays as constructed
+    others += [f"{f.name}.{k}" for f in model.frames if f.fourbar is not None for k in CRANK_FIRST]
+    others = [name for name in others if name not in zeros]
     terms = list(dict.fromkeys(n for t in model.terms for n in t.parameter_names))
-    own = [f"{f.name}.elastic_{ANGLE_OF_AXIS[str(f.axis)]}" for f in model.joints if not f.prismatic]
-    cross = [f"{f.name}.{k}" for f in model.frames for k in ELASTIC_KINDS if f"{f.name}.{k}" not in own]
+    own = [f.elastic_name for f in model.joints if not f.prismatic]
+    every = [f"{f.name}.{k}" for f in model.frames for k in frame_kinds(f) if k.startswith("elastic_")]
+    cross = [name for name in every if name not in own]
     if parameters == "standard":
         return Candidates((*ends, *zeros, *others, *terms), tuple(own), tuple(cross))
     if parameters == "none":
@@ -118,7 +125,7 @@ def limit_rules(model: RobotModel, names: Sequence[str]) -> tuple[Array, NDArray
     """Limits (p,) that do not depend on the poses, and the column (p,) of the moment that the others depend on (-1)."""
     limits, columns = np.full(len(names), np.inf), np.full(len(names), -1, dtype=np.intp)
     moment = {name: k for k, name in enumerate(moment_names(model))}
-    frames = {f.name for f in model.frames}
+    frames = {f.name: f for f in model.frames}
     priors = {f"{t.name}.{short}": 2.0 * sigma for t in model.terms for short, sigma in t.priors.items()}
     for k, name in enumerate(names):
         frame, _, kind = name.rpartition(".")
@@ -128,12 +135,13 @@ def limit_rules(model: RobotModel, names: Sequence[str]) -> tuple[Array, NDArray
             limits[k] = WIRE_LIMITS[kind]
         if frame not in frames:
             continue
-        if kind in ("x", "y", "z"):
+        if kind in ("x", "y", "z", *FOUR_BAR_LENGTHS):
             limits[k] = PLAUSIBLE_LENGTH
-        elif kind in ("roll", "pitch", "yaw"):
+        elif kind in ("roll", "pitch", "yaw", "crank_angle"):
             limits[k] = PLAUSIBLE_ANGLE
         else:
-            columns[k] = moment[f"{identifier(frame)}_m{kind.removeprefix('elastic_')}"]
+            about = frames[frame].joint_kind if kind == "elastic_crank" else kind.removeprefix("elastic_")
+            columns[k] = moment[f"{identifier(frame)}_m{about}"]
     return limits, columns
 
 

@@ -188,10 +188,10 @@ class _Surroundings:
         depth = np.linspace(0.0, self.request.distance, _CONE)
         on_axis = base_T_sensor[:, None, :3, 3] + depth[:, None] * base_T_sensor[:, None, :3, 2]
         radii = depth * np.tan(self.request.cone)
-        cone = PlacedCapsules(on_axis, on_axis, radii, np.full(_CONE, self.chain.n_joints))
+        cone = PlacedCapsules(on_axis, on_axis, radii, np.full(_CONE, len(self.chain.axes)))
         clear = obstacle_clearance(cone, self.request.obstacles) > 0
         placed = self._placed(q)
-        for k in np.flatnonzero(placed.link < self.chain.n_joints - 1):
+        for k in np.flatnonzero(placed.link < len(self.chain.axes) - 1):
             start, end = placed.start[:, k, None], placed.end[:, k, None]
             gap = segment_distance(on_axis, on_axis, start, end) - placed.radius[k] - radii
             clear &= np.all(gap > 0, axis=1)

@@ -138,7 +138,7 @@ def _start(reference: CalibratedRobot, nominal: RobotModel) -> RobotModel:
 
 def _geometry(nominal: RobotModel) -> tuple[list[str], list[str]]:
     """Names of the joints' zeros and of all other geometric parameters."""
-    zeros = [f"{f.name}.{f.joint_kind}" for f in nominal.joints]
+    zeros = [f.zero_name for f in nominal.joints]
     others = [f"{f.name}.{k}" for f in nominal.frames for k in GEOMETRIC_KINDS if f"{f.name}.{k}" not in zeros]
     return zeros, others
 

@@ -280,7 +280,7 @@ def _mastering(
 
 def zero_parameter(joint: Frame) -> str:
     """Name of the parameter that a joint's zero offset adds to, times the joint's sign."""
-    return f"{joint.name}.{joint.joint_kind}"
+    return joint.zero_name
 
 
 def _with_offsets(robot: CalibratedRobot, solved: _Solved, log: JointLog) -> CalibratedRobot:
@@ -294,8 +294,8 @@ def _with_offsets(robot: CalibratedRobot, solved: _Solved, log: JointLog) -> Cal
         if name in joints:
             k, f = joints[name]
             parameter = zero_parameter(f)
-            values[parameter] = values.get(parameter, 0.0) + f.sign * float(state.offset[k])
-            of_unknown.append((parameter, i, float(f.sign)))
+            values[parameter] = values.get(parameter, 0.0) + f.zero_sign * float(state.offset[k])
+            of_unknown.append((parameter, i, float(f.zero_sign)))
         elif "." in name:
             of_unknown.append((name, i, 1.0))
     new += [name for name, _, _ in of_unknown if name not in new]

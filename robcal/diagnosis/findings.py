@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from robcal.diagnosis.core.fitting import Accepted, Fit, fit, pseudo_covariance
+from robcal.diagnosis.core.fitting import Accepted, Fit, fit
 from robcal.diagnosis.core.recording import Recording, observation_data
 from robcal.diagnosis.core.result import Finding, Rival
 from robcal.diagnosis.gain.heldout import cross_validated, folds, position_errors, rms
@@ -15,6 +15,7 @@ from robcal.diagnosis.scan.posterior import rivals, signature
 from robcal.diagnosis.scan.statistics import orthonormal_basis
 from robcal.diagnosis.search.curves import Curves
 from robcal.diagnosis.search.selection import Selection, poses_that_carry
+from robcal.estimation.minimum_norm import pseudo_covariance
 from robcal.physics.cause import Array, ObservationCause, ObservationData, numeric_sigma, prior_scale
 from robcal.physics.measuring import swapped
 from robcal.robot.model import RobotModel

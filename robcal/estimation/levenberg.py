@@ -16,9 +16,19 @@ from robcal.estimation.summary import SolveSummary, TerminationSettings
 
 State = TypeVar("State")
 
-_FIRST, _GROW, _SHRINK, _NONE = 1e-6, 10.0, 0.1, 1e-8
+_FIRST, _NONE = 1e-6, 1e-8
 _ROUNDING = 1e-12
 """A cost may rise by this share (and as much in all) by rounding."""
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Damping at the start, its factors after rejected and accepted steps, and below what a step counts as undamped."""
+
+    start: float = 0.0
+    grow: float = 10.0
+    shrink: float = 0.1
+    undamped: float = 1e-3
 
 
 @dataclass(frozen=True)
@@ -42,14 +52,17 @@ class Linearised(Generic[State]):
 
 
 def levenberg(
-    linearise: Callable[[State], Linearised[State]], start: State, settings: TerminationSettings
+    linearise: Callable[[State], Linearised[State]],
+    start: State,
+    settings: TerminationSettings,
+    schedule: Schedule = Schedule(),
 ) -> tuple[State, SolveSummary]:
     """Minimise; ``max_halvings`` is how often the damping may grow in one step.
 
     Converged when a step is predicted to save less than ``max(cost_tolerance * (1 + cost), negligible)`` of the cost.
     """
     begin = time.perf_counter()
-    state, damping, halvings = start, 0.0, 0
+    state, damping, halvings = start, schedule.start, 0
     history: list[float] = []
     converged, why = False, f"stopped after {settings.max_iterations} iterations"
     for _ in range(settings.max_iterations):
@@ -62,22 +75,23 @@ def levenberg(
             try:
                 trial, predicted = local.propose(damping)
             except np.linalg.LinAlgError:
-                damping = max(_GROW * damping, 1e-3 * _FIRST)
+                damping = max(schedule.grow * damping, 1e-3 * _FIRST)
                 continue
             cost = local.evaluate(trial)
             accepted = cost <= local.cost * (1.0 + _ROUNDING) + _ROUNDING
             if accepted or predicted < small:
                 break
             halvings += 1
-            damping = max(_GROW * damping, _FIRST)
+            damping = max(schedule.grow * damping, _FIRST)
         if not accepted:
             converged = predicted < small
             why = "a further step would not lower the cost" if converged else "no step lowers the cost"
             break
         state = trial
         history.append(cost)
-        damping = 0.0 if _SHRINK * damping < _NONE else _SHRINK * damping
-        if predicted < small and damping < 1e-3 and local.settled(state):
+        damping *= schedule.shrink
+        damping = 0.0 if damping < _NONE else damping
+        if predicted < small and damping < schedule.undamped and local.settled(state):
             converged, why = True, "the last step lowered the cost by less than the tolerance"
             break
     seconds = time.perf_counter() - begin

@@ -71,6 +71,7 @@ class MeasuredTable:
     loops : kinds of closed loops by name; ``loop`` : (m,) which of them, in that order.
     shared : what the points have in common, where the system states it; it is part of ``covariance``.
     sources : further files that the table was made from.
+    q : (m, N) joint angles that the rows state themselves, rad or m; None where they state none.
     """
 
     kind: Kind
@@ -87,6 +88,7 @@ class MeasuredTable:
     loop: IntArray | None = None
     shared: SharedErrors | None = None
     sources: tuple[Path, ...] = ()
+    q: Array | None = None
 
     def __len__(self) -> int:
         return len(self.pose)
@@ -108,6 +110,7 @@ class MeasuredTable:
             angles=None if self.angles is None else self.angles[kept],
             loop=None if self.loop is None else self.loop[kept],
             shared=None if self.shared is None else self.shared.select(kept),
+            q=None if self.q is None else self.q[kept],
         )
 
 
@@ -136,12 +139,14 @@ def read_measurements(path: Path, pose_names: Sequence[str], kind: Kind | None =
     return measurements_of(read_table(path), pose_names, kind)
 
 
-def measurements_of(table: Table, pose_names: Sequence[str], kind: Kind | None = None) -> MeasuredTable:
-    """The measurements of a table, as :func:`read_measurements` does it."""
+def measurements_of(
+    table: Table, pose_names: Sequence[str], kind: Kind | None = None, q: Array | None = None
+) -> MeasuredTable:
+    """The measurements of a table, as :func:`read_measurements` does it; ``q`` : angles that its rows state."""
     path = table.path
     kind = kind or _kind(table)
     if kind == "constraints":
-        return _constraints(table, pose_names)
+        return replace(_constraints(table, pose_names), q=q)
     needed = {
         "points": ["pose", "target", "x_mm", "y_mm", "z_mm"],
         "sensor_points": ["pose", "target", "x_mm", "y_mm", "z_mm"],
@@ -169,7 +174,9 @@ def measurements_of(table: Table, pose_names: Sequence[str], kind: Kind | None =
     _check_size(table, values)
     covariates = {name: table.numbers(name) for name in ("cycle", "time_s") if table.has(name)}
     angles = six[:, 3:] if kind == "frames" else None
-    measured = MeasuredTable(kind, path, pose, table.rows, target, values, covariance, covariates, tuple(notes), angles)
+    measured = MeasuredTable(
+        kind, path, pose, table.rows, target, values, covariance, covariates, tuple(notes), angles, q=q
+    )
     return _without_empty(measured, pose_names)
 
 

@@ -12,6 +12,7 @@ from robcal.calibration.joint_log import JointLog, approach_from_order
 from robcal.errors import InvalidInput
 from robcal.files.schemas import proposal, shown
 from robcal.files.tables import Table, read_table
+from robcal.robot.loops import closing
 from robcal.robot.model import RobotModel
 from robcal.transforms import Array
 
@@ -77,6 +78,7 @@ def poses_of(table: Table, robot: RobotModel | None, payloads: Collection[str], 
     joints = joint_columns(robot)
     _check_joint_columns(table, [name for name, _ in joints])
     q = np.column_stack([table.numbers(name) * factor for name, factor in joints])
+    _refuse_open_loops(table, robot, q)
     notes: list[str] = []
     approach, inferred = _approach(table, q, to_predict, notes)
     known = {"pose", "payload", "set", "target", "turn_deg", *(name for name, _ in joints)}
@@ -140,6 +142,21 @@ def _check_joint_columns(table: Table, wanted: list[str]) -> None:
             f"{table.path}, row 1: column '{beyond[0]}' has no joint: the robot has {len(wanted)} joints "
             f"({', '.join(wanted)})"
         )
+
+
+def _refuse_open_loops(table: Table, robot: RobotModel, q: Array) -> None:
+    for f in robot.frames:
+        if (bar := f.fourbar) is None:
+            continue
+        phi = q[:, bar.driver] + bar.crank_zero
+
+        def sentence(i: int, name: str = f.name, column: int = bar.driver) -> str:
+            return (
+                f"the four-bar of frame '{name}' does not close at q{column + 1}_deg = {np.degrees(q[i, column]):g}: "
+                "correct the angle, or lengths_mm and crank_zero_deg in the robot file"
+            )
+
+        table.refuse((np.abs(closing(bar.lengths, phi)) > 1.0).tolist(), sentence)
 
 
 def _outside(table: Table, robot: RobotModel, q: Array) -> str:

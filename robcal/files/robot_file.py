@@ -13,20 +13,16 @@ import numpy as np
 from pydantic import BeforeValidator, Field
 
 from robcal.errors import InvalidInput
+from robcal.files.robot_frames import FrameEntry, chain_frames, frame_data, frame_faults, listed, metres
 from robcal.files.schemas import Entry, NotNegative, Number, Text, Triple, proposal, read_entry
 from robcal.files.storage import write_text
 from robcal.files.yaml_io import FlowMapping, YamlDocument, yaml_text
-from robcal.robot.model import RESERVED_FRAME_NAMES, Frame, Payload, RobotModel, Term
+from robcal.robot.loops import FOUR_BAR_KINDS
+from robcal.robot.model import RESERVED_FRAME_NAMES, Payload, RobotModel, Term
 from robcal.transforms import Array, frame_from_xyzrpy, xyzrpy_from_frame
 
 FORMAT = "robcal/robot-1"
 STANDARD_GRAVITY = (0.0, 0.0, -9.80665)
-
-
-def _sign(value: Any) -> Any:
-    if value not in (1, -1):
-        raise ValueError(f"sign must be 1 or -1, found {value!r}")
-    return int(value)
 
 
 def _six(value: Any) -> Any:
@@ -52,22 +48,7 @@ Placement = Annotated[PlacementEntry, BeforeValidator(_six)]
 def placement_data(a_T_b: Array) -> FlowMapping:
     """A frame as the mapping that stands in files."""
     six = xyzrpy_from_frame(a_T_b)
-    return FlowMapping(xyz_mm=_listed(six[:3] * 1000), rpy_deg=_listed(np.degrees(six[3:])))
-
-
-class FrameEntry(Entry):
-    """One frame of the chain."""
-
-    name: Text
-    axis: Literal["x", "y", "z"] | None
-    type: Literal["revolute", "prismatic"] = "revolute"
-    sign: Annotated[int, BeforeValidator(_sign)] = 1
-    range_deg: tuple[Number, Number] | None = None
-    range_mm: tuple[Number, Number] | None = None
-    xyz_mm: Triple = (0.0, 0.0, 0.0)
-    rpy_deg: Triple = (0.0, 0.0, 0.0)
-    mass_kg: NotNegative = 0.0
-    cog_mm: Triple = (0.0, 0.0, 0.0)
+    return FlowMapping(xyz_mm=listed(six[:3] * 1000), rpy_deg=listed(np.degrees(six[3:])))
 
 
 class PayloadEntry(Entry):
@@ -78,7 +59,7 @@ class PayloadEntry(Entry):
 
     def payload(self) -> Payload:
         """The load in SI units."""
-        return Payload(mass=self.mass_kg, cog=_metres(self.cog_mm))
+        return Payload(mass=self.mass_kg, cog=metres(self.cog_mm))
 
 
 class TermEntry(Entry):
@@ -109,14 +90,6 @@ class RobotEntry(Entry):
     flange_T_tool: Placement | None = None
 
 
-def _metres(values: Triple) -> Triple:
-    return (values[0] / 1000, values[1] / 1000, values[2] / 1000)
-
-
-def _radians(values: Triple) -> Triple:
-    return (math.radians(values[0]), math.radians(values[1]), math.radians(values[2]))
-
-
 def read_robot(path: Path | str) -> RobotModel:
     """Read a robot.
 
@@ -130,7 +103,7 @@ def read_robot(path: Path | str) -> RobotModel:
         raise InvalidInput(faults[0], faults)
     return RobotModel(
         name=entry.name,
-        frames=tuple(_frame(frame) for frame in entry.frames),
+        frames=chain_frames(entry.frames),
         gravity=entry.gravity_m_s2,
         gravity_frame=entry.gravity_frame,
         parameters=dict(entry.parameters),
@@ -141,26 +114,6 @@ def read_robot(path: Path | str) -> RobotModel:
         payloads={name: load.payload() for name, load in entry.payloads.items()},
         world_T_base=entry.world_T_base.matrix() if entry.world_T_base else None,
         flange_T_tool=entry.flange_T_tool.matrix() if entry.flange_T_tool else None,
-    )
-
-
-def _frame(entry: FrameEntry) -> Frame:
-    prismatic = entry.type == "prismatic"
-    limits: tuple[float, float] | None = None
-    if prismatic and entry.range_mm is not None:
-        limits = (entry.range_mm[0] / 1000, entry.range_mm[1] / 1000)
-    elif entry.range_deg is not None:
-        limits = (math.radians(entry.range_deg[0]), math.radians(entry.range_deg[1]))
-    return Frame(
-        name=entry.name,
-        axis=entry.axis,
-        prismatic=prismatic,
-        sign=entry.sign,
-        limits=limits,
-        xyz=_metres(entry.xyz_mm),
-        rpy=_radians(entry.rpy_deg),
-        mass=entry.mass_kg,
-        cog=_metres(entry.cog_mm),
     )
 
 
@@ -176,15 +129,7 @@ def _faults(entry: RobotEntry, document: YamlDocument) -> Iterator[str]:
                 f"{where}: a frame's name must have no dot and not be base, tool, gravity, payload or world: "
                 "it is the first half of parameter names"
             )
-        if frame.type == "prismatic" and frame.axis is None:
-            yield f"{where}: a sliding joint needs an axis (x, y or z)"
-        if frame.range_mm is not None and frame.type != "prismatic":
-            yield f"{where}: range_mm is for sliding joints: use range_deg or add 'type: prismatic'"
-        if frame.range_deg is not None and frame.type == "prismatic":
-            yield f"{where}: range_deg is for turning joints: use range_mm"
-        for limits in (frame.range_deg, frame.range_mm):
-            if limits is not None and limits[0] >= limits[1]:
-                yield f"{where}: the range {list(limits)} is empty: the smaller limit comes first"
+    yield from frame_faults(entry.frames, document)
     if not any(frame.axis for frame in entry.frames):
         yield f"{document.path}: the chain has no joints: at least one frame needs an axis (x, y or z)"
     size = math.dist(entry.gravity_m_s2, (0, 0, 0))
@@ -193,9 +138,10 @@ def _faults(entry: RobotEntry, document: YamlDocument) -> Iterator[str]:
             f"{document.path}, line {document.line(('gravity_m_s2',))}: gravity of {size:.4g} m/s2 is not of this "
             "world: it is in m/s2, about 9.81"
         )
+    kinds = {f.name: [*_FRAME_KINDS, *(FOUR_BAR_KINDS if f.fourbar else ())] for f in entry.frames}
     known_terms = {term.name for term in entry.terms}
     for key in entry.parameters:
-        yield from _parameter_faults(key, names, known_terms, set(entry.payloads), document)
+        yield from _parameter_faults(key, kinds, known_terms, set(entry.payloads), document)
     for i, term in enumerate(entry.terms):
         if term.frame not in {*names, "base", "tool"}:
             yield (
@@ -209,7 +155,7 @@ _FRAME_KINDS = [*_KINDS, "elastic_roll", "elastic_pitch", "elastic_yaw"]
 
 
 def _parameter_faults(
-    key: str, frames: list[str], terms: set[str], payloads: set[str], document: YamlDocument
+    key: str, frames: dict[str, list[str]], terms: set[str], payloads: set[str], document: YamlDocument
 ) -> Iterator[str]:
     owner, _, kind = key.rpartition(".")
     where = f"{document.path}, line {document.line(('parameters', key))}: parameter '{key}'"
@@ -219,47 +165,25 @@ def _parameter_faults(
         if owner.removeprefix("payload.") not in payloads or kind not in {"mass", "x", "y", "z"}:
             yield f"{where} names no payload of this file: payload.<name>.mass, x, y or z"
         return
-    known = {"base": _KINDS, "tool": _KINDS, "gravity": ["tilt_x", "tilt_y"], **dict.fromkeys(frames, _FRAME_KINDS)}
+    known = {"base": _KINDS, "tool": _KINDS, "gravity": ["tilt_x", "tilt_y"], **frames}
     if owner not in known:
         yield f"{where}: there is no frame '{owner}'{proposal(owner, list(known))}"
     elif kind not in known[owner]:
         yield f"{where}: unknown kind '{kind}'{proposal(kind, known[owner])}"
 
 
-def _listed(values: Array) -> list[float]:
-    # twelve decimals of a millimetre or degree: below any meaning, above the noise of unit conversion
-    return [float(v) + 0.0 for v in np.round(np.asarray(values, dtype=float), 12)]
-
-
 def robot_data(model: RobotModel) -> dict[str, Any]:
     """The file's content as plain data."""
-    frames = []
-    for frame in model.frames:
-        row = FlowMapping(name=frame.name, axis=frame.axis)
-        if frame.prismatic:
-            row["type"] = "prismatic"
-        if frame.axis is not None:
-            row["sign"] = int(frame.sign)
-            if frame.limits is not None:
-                limits = np.array(frame.limits)
-                key, shown = ("range_mm", limits * 1000) if frame.prismatic else ("range_deg", np.degrees(limits))
-                row[key] = _listed(shown)
-        row["xyz_mm"] = _listed(np.asarray(frame.xyz) * 1000)
-        row["rpy_deg"] = _listed(np.degrees(frame.rpy))
-        if frame.mass or np.any(frame.cog):
-            row["mass_kg"] = float(frame.mass)
-            row["cog_mm"] = _listed(np.asarray(frame.cog) * 1000)
-        frames.append(row)
     data: dict[str, Any] = {"format": FORMAT, "name": model.name, "gravity_m_s2": [float(v) for v in model.gravity]}
     if model.gravity_frame != "base":
         data["gravity_frame"] = model.gravity_frame
-    data["frames"] = frames
+    data["frames"] = frame_data(model.frames)
     data["parameters"] = {name: float(value) for name, value in model.parameters.items()}
     if model.terms:
         data["terms"] = [_term_data(term) for term in model.terms]
     if model.payloads:
         data["payloads"] = {
-            name: FlowMapping(mass_kg=float(load.mass), cog_mm=_listed(np.asarray(load.cog) * 1000))
+            name: FlowMapping(mass_kg=float(load.mass), cog_mm=listed(np.asarray(load.cog) * 1000))
             for name, load in model.payloads.items()
         }
     if model.world_T_base is not None:

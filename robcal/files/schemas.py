@@ -19,6 +19,8 @@ from robcal.files.yaml_io import YamlDocument, read_yaml
 
 MAX_TEXT = 1000
 """Characters of a name or path; longer ones are no names."""
+LARGEST = 1e30
+"""Numbers beyond are no quantity of any robot, and their squares overflow."""
 MOST_ROUNDS = 12
 """How often an entry is left out and the rest looked at again."""
 
@@ -34,6 +36,8 @@ def _number(value: Any) -> Any:
         raise ValueError("is too large for a number") from None
     if not math.isfinite(number):
         raise ValueError(f"must be a finite number, found {value}")
+    if abs(number) > LARGEST:
+        raise ValueError(f"must be a number below {LARGEST:g}, found {value}")
     return number
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from robcal.errors import InvalidInput
-from robcal.files.schemas import proposal, shown
+from robcal.files.schemas import LARGEST, proposal, shown
 from robcal.files.storage import read_bytes, write_text
 from robcal.transforms import Array
 
@@ -122,6 +122,10 @@ class Table:
         self.refuse(
             ~np.isfinite(values), lambda i: f"{name} is {_bad_number(cells[i])}: give a finite number or remove the row"
         )
+        remedy = "give the number or remove the row"
+        self.refuse(
+            np.abs(values) > LARGEST, lambda i: f"{name} is {shown(cells[i])}, no quantity is as large: {remedy}"
+        )
         if positive:
             remedy = "it must be larger than zero: correct it or remove the column"
             self.refuse(values <= 0, lambda i: f"{name} is {cells[i]}, {remedy}")
@@ -138,7 +142,7 @@ class Table:
     def number_column(self, name: str) -> Array | None:
         """A column of numbers if every cell is one, None if not (an unknown column of text)."""
         values = np.array([_float_or_nan(cell) for cell in self.columns[name]], dtype=float)
-        return values if np.isfinite(values).all() and len(values) else None
+        return values if (np.abs(values) <= LARGEST).all() and len(values) else None
 
     def unique(self, names: Sequence[str]) -> None:
         """Raise InvalidInput if two rows agree in these columns."""

@@ -137,16 +137,14 @@ def _matrices(b: Array) -> Array:
     return np.stack([b[:, [0, 1]], b[:, [1, 2]]], axis=1)
 
 
-def _bilinear(image: NDArray, x: Array, y: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Values at sub-pixel places and whether they lie in the image."""
-    height, width = image.shape
-    inside = (x >= 0) & (y >= 0) & (x <= width - 1) & (y <= height - 1)
-    column = np.clip(np.floor(x).astype(int), 0, width - 2)
-    row = np.clip(np.floor(y).astype(int), 0, height - 2)
-    fx, fy = np.clip(x - column, 0, 1), np.clip(y - row, 0, 1)
-    upper = image[row, column] * (1 - fx) + image[row, column + 1] * fx
-    lower = image[row + 1, column] * (1 - fx) + image[row + 1, column + 1] * fx
-    return upper * (1 - fy) + lower * fy, inside
+def _grey_values(image: NDArray, xy: Array, b: Array, rho: Array, phi: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Grey values (n, r, m) on circles of the radii rho of the dots' unit planes; whether all lie in the image."""
+    from robcal.imaging import ring_loop  # compiled: imported where it runs
+
+    grey = np.empty((len(xy), len(rho), len(phi)))
+    circle = np.stack([np.cos(phi), np.sin(phi)], axis=-1)
+    pixels = np.ascontiguousarray(image)
+    return grey, ring_loop.sample_rings(pixels, np.asarray(xy, float), np.linalg.inv(_matrices(b)), rho, circle, grey)
 
 
 def _profile_widths(b: Array, s: Array, phi: Array) -> tuple[Array, Array]:
@@ -159,14 +157,13 @@ def _profile_widths(b: Array, s: Array, phi: Array) -> tuple[Array, Array]:
     return s[:, None] * radial, s[:, None] * angular
 
 
-def _window(delta: Array, sigma: Array, step: float) -> Array:
-    """Brightness of a segment of the angle ``step`` at the angle delta from its middle, blurred by sigma (rad)."""
-    half = 0.5 * step
-    return ndtr((delta + half) / sigma) - ndtr((delta - half) / sigma)
+def _segments(phi: Array, phase: Array, sigma: Array, segments: int) -> tuple[Array, Array]:
+    """Brightness (n, m, k) of k segments at the angles phi (m,), blurred by sigma (n, m) rad, and its derivative."""
+    from robcal.imaging import ring_loop  # compiled: imported where it runs
 
-
-def _wrap(angle: Array) -> Array:
-    return (angle + np.pi) % (2.0 * np.pi) - np.pi
+    brightness, density = np.empty((2, *sigma.shape, segments))
+    ring_loop.blur_segments(phi, phase, np.ascontiguousarray(sigma), brightness, density)
+    return brightness, density
 
 
 def read_rings(  # noqa: PLR0913 - columns of many dots
@@ -198,13 +195,9 @@ def read_rings(  # noqa: PLR0913 - columns of many dots
         return empty
     # a censored dot is brighter than what the ring can show
     contrast = np.minimum(contrast, saturation - background)
-    to_image = np.linalg.inv(_matrices(b))
     s = np.sqrt(blur**2 + _INTERPOLATION_VARIANCE)
     rho = np.concatenate([pattern.in_gap, pattern.in_ring])
-    circle = np.stack([np.cos(phi), np.sin(phi)], axis=-1)
-    places = np.einsum("nij,aj->nai", to_image, circle)[:, None] * rho[None, :, None, None] + xy[:, None, None]
-    grey, inside = _bilinear(image, places[..., 0], places[..., 1])
-    complete = inside.all(axis=(1, 2))
+    grey, complete = _grey_values(image, xy, b, rho, phi)
     radial, angular = _profile_widths(b, s, phi)
     # in units of the dot's contrast, without the dot's own glare
     y = (grey - background[:, None, None]) / np.maximum(contrast, 1e-6)[:, None, None]
@@ -253,7 +246,7 @@ class _Fit:
 
 def _fit(profile: Array, sigma_angle: Array, pattern: RingPattern) -> _Fit:
     """Phase and segment brightnesses from (n, m) profiles at the pattern's angles."""
-    n, segments, phi, width = len(profile), pattern.segments, pattern.angles, pattern.step
+    n, segments, phi = len(profile), pattern.segments, pattern.angles
     # coarse phase: the shift by whole samples whose sector means leave least
     step = 2.0 * np.pi / len(phi)
     best, phase = np.full(n, np.inf), np.zeros(n)
@@ -264,19 +257,13 @@ def _fit(profile: Array, sigma_angle: Array, pattern: RingPattern) -> _Fit:
         best[better], phase[better] = spread[better], shift * step
     amplitude = np.zeros((n, segments))
     inverse = np.zeros((n, segments, segments))
-    middle = (np.arange(segments) + 0.5) * width
     ridge = 1e-6 * np.eye(segments)
     for _ in range(4):
-        delta = _wrap(phi[None, :, None] - phase[:, None, None] - middle[None, None, :])
-        sigma = sigma_angle[:, :, None]
-        templates = _window(delta, sigma, width)
+        templates, density = _segments(phi, phase, sigma_angle, segments)
         inverse = np.linalg.inv(np.matmul(templates.transpose(0, 2, 1), templates) + ridge)
         amplitude = np.einsum("nkl,npl,np->nk", inverse, templates, profile)
         residual = profile - np.einsum("npk,nk->np", templates, amplitude)
-        half = 0.5 * width
-        upper, lower = (delta + half) / sigma, (delta - half) / sigma
-        density = (np.exp(-0.5 * np.minimum(upper**2, 60.0)) - np.exp(-0.5 * np.minimum(lower**2, 60.0))) / sigma
-        slope = -np.einsum("npk,nk->np", density, amplitude) / np.sqrt(2.0 * np.pi)
+        slope = -np.einsum("npk,nk->np", density, amplitude)
         turn = (slope * residual).sum(axis=1) / np.maximum((slope**2).sum(axis=1), 1e-9)
         phase = phase + np.clip(turn, -0.1, 0.1)
     bright = amplitude > 0.5 * np.sort(amplitude, axis=1)[:, -1:]
@@ -298,9 +285,7 @@ def _is_certain(
     good &= (distance > np.maximum(_MARGIN, 4.0 * sigma)).all(axis=1)
     # too blurred to be distinguished
     good &= (factor.max(axis=1) > 0.35).all(axis=1) & (sigma_angle.max(axis=1) < 0.45 * pattern.step)
-    middle = (np.arange(pattern.segments) + 0.5) * pattern.step
-    delta = _wrap(pattern.angles[None, :, None] - fit.phase[:, None, None] - middle[None, None, :])
-    templates = _window(delta, sigma_angle[:, :, None], pattern.step)
+    templates, _ = _segments(pattern.angles, fit.phase, sigma_angle, pattern.segments)
     predicted = np.einsum("npk,nk->np", templates, fit.bits.astype(float))
     misfit = ring * scale[:, None, None] - factor * predicted[:, None, :]
     # a slow change of brightness around the ring is shading, not a wrong code
@@ -324,13 +309,11 @@ def ring_glare(xy: Array, b: Array, s: Array, reading: RingReadings, row: Array,
     phi, count = pattern.angles, len(pattern.angles)
     # around the ring the brightness depends on the angle alone; its blur is that at the ring's inner edge, from where
     # the glare comes
-    around = np.zeros((len(xy), count))
     tangent = np.stack([-np.sin(phi), np.cos(phi)], axis=-1)
     angular = s[:, None] * np.linalg.norm(np.einsum("nij,aj->nai", matrix, tangent), axis=-1) / pattern.in_ring[0]
-    for k in range(pattern.segments):
-        middle = reading.phase[row] + (k + 0.5) * pattern.step
-        around += reading.bits[row, k, None] * _window(_wrap(phi[None] - middle[:, None]), angular, pattern.step)
-    around = (reading.level[row][:, None] * around).astype(x.dtype)
+    segments, _ = _segments(phi, reading.phase[row], angular, pattern.segments)
+    lit = reading.level[row][:, None] * reading.bits[row]
+    around = np.einsum("npk,nk->np", segments, lit).astype(x.dtype)
     cx, cy, b11, b12, b22, blur = (column.astype(x.dtype)[:, None] for column in (*xy.T, *b.T, s))
     dx, dy = x - cx, y - cy
     u, v = b11 * dx + b12 * dy, b12 * dx + b22 * dy

@@ -33,7 +33,7 @@ def without_masses(model: RobotModel) -> bool:
 
 
 def _gravity_sag(site: RobotSite, joint: Joint) -> Iterator[RobotCause]:
-    if joint.prismatic or not without_masses(site.model):
+    if joint.prismatic or site.model.has_loops or not without_masses(site.model):
         return
     for angle in (joint.own_angle, *joint.cross_angles):
         own = angle == joint.own_angle

@@ -73,7 +73,7 @@ class RobotSite:
     @property
     def joints(self) -> tuple[Joint, ...]:
         """The joints in order."""
-        moving = [frame for frame in self.model.frames if frame.axis is not None]
+        moving = [frame for frame in self.model.frames if frame.is_joint]
         return tuple(
             Joint(k, frame.name, frame.axis or "", frame.sign, frame.prismatic) for k, frame in enumerate(moving, 1)
         )

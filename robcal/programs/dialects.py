@@ -1,6 +1,5 @@
 """The dialects by name and by the suffix of a program's file."""
 
-import math
 import re
 from collections.abc import Callable, Mapping
 
@@ -18,6 +17,8 @@ READERS: Mapping[str, Callable[[Source], Program]] = {
     "urscript": read_urscript,
     "fanuc": read_fanuc,
 }
+LARGEST = 1e30
+"""Numbers beyond are no target; their squares overflow."""
 COMMENTS = {"krl": ";", "rapid": "!", "urscript": "#", "fanuc": "!"}
 SUFFIXES = {
     ".src": "krl", ".mod": "rapid", ".modx": "rapid", ".sys": "rapid", ".sysx": "rapid", ".prg": "rapid",
@@ -57,7 +58,7 @@ def read_program(dialect: str, source: Source, data: Source | None = None) -> Pr
                     sum(len(part) for part in text.text.splitlines(keepends=True)[: number - 1]),
                     "the program is corrected already: correct the one that it was made from",
                 )
-        endless = next((m for m in re.finditer(NUMBER, text.text) if float(m[0]) == math.inf), None)
+        endless = next((m for m in re.finditer(NUMBER, text.text) if float(m[0]) > LARGEST), None)
         if endless is not None:
             raise text.refuse(endless.start(), f"the number {endless[0][:20]} is beyond all measure")
         if "\x00" in text.text:

@@ -234,16 +234,15 @@ def _offset(reader: _Reader, head: Token, items: Sequence[Token]) -> Written:
 
 def _rest_of(reader: _Reader, point: Written) -> str:
     """Configuration and external axes of a target as they stand in the text."""
-    source = tokens(reader.text[point.start :], "!", '"', r"[A-Za-z_]\w*", (":=",))
-    depth, stop = 0, 0
-    for token in source:
-        depth += (token.kind in "([{") - (token.kind in ")]}")
-        if depth == 0:
-            stop = token.stop
-            break
     if reader.text[point.start] != "[":
         raise reader.names.refuse(0, point.start, "an offset from an offset: write it as one")
-    inside = [t for t in source if t.stop < stop and t.start > 0 and t.kind != "end"]
+    depth, inside = 0, []
+    for token in tokens(reader.text[point.start :], "!", '"', r"[A-Za-z_]\w*", (":=",)):
+        depth += (token.kind in "([{") - (token.kind in ")]}")
+        if depth == 0:  # the bracket that closes the target: what follows is not looked at
+            break
+        if token.start > 0 and token.kind != "end":
+            inside.append(token)
     parts = split(inside, ",")[2:]
     return ",".join(reader.text[point.start + p[0].start : point.start + p[-1].stop] for p in parts)
 

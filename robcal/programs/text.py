@@ -5,7 +5,7 @@ replaced is written back as it was read.
 """
 
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from robcal.errors import InvalidInput
@@ -58,8 +58,8 @@ SHORT_MARK = "corrected by robcal"
 NUMBER = r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 
 
-def tokens(text: str, comment: str, strings: str, word: str, symbols: Sequence[str] = ()) -> list[Token]:
-    """Tokens of a text without its comments and blanks; the end of each line is a token 'end'.
+def tokens(text: str, comment: str, strings: str, word: str, symbols: Sequence[str] = ()) -> Iterator[Token]:
+    """Tokens, one after the other, of a text without its comments and blanks; the end of each line is a token 'end'.
 
     Parameters
     ----------
@@ -73,12 +73,10 @@ def tokens(text: str, comment: str, strings: str, word: str, symbols: Sequence[s
         rf"(?P<blank>[ \t\r\f\v]+|{re.escape(comment)}[^\n]*)|(?P<end>\n)|(?P<string>{quoted})|(?P<word>{word})"
         rf"|(?P<number>{NUMBER})|(?P<symbol>{several}|.)"
     )
-    found = []
     for match in pattern.finditer(text):
         kind = str(match.lastgroup)
         if kind != "blank":
-            found.append(Token(match[0] if kind == "symbol" else kind, match[0], match.start()))
-    return found
+            yield Token(match[0] if kind == "symbol" else kind, match[0], match.start())
 
 
 def split(items: Sequence[Token], separator: str) -> list[list[Token]]:

@@ -28,13 +28,15 @@ NOT_CONFIRMED = "not confirmed on blocked folds, where poses are predicted no be
 class Told:
     """A cause, which instrument shows it, which others do, and which contradict it.
 
-    ``of_instrument`` : it belongs to the instrument, not to the robot.
+    ``of_instrument`` : it belongs to the instrument, not to the robot. by_priors : what is believed of the robot's
+    lengths tells it, no residual does.
     """
 
     finding: Finding
     instrument: str
     agreeing: tuple[str, ...] = ()
     contradicting: tuple[str, ...] = ()
+    by_priors: bool = False
 
     @property
     def of_instrument(self) -> bool:
@@ -51,7 +53,8 @@ class Told:
                 f"{self.finding.told}"
             )
         if self.of_instrument:
-            return f"instrument '{self.instrument}': {self.finding.told}"
+            why = "; else links would be off by more than they are believed to be" if self.by_priors else ""
+            return f"instrument '{self.instrument}': {self.finding.told}{why}"
         return self.finding.told
 
 
@@ -135,7 +138,9 @@ def delivered(anew: Anew, told: Sequence[Told], not_told: tuple[str, ...]) -> In
         if not needless:
             folds = InstrumentFolds(again, anew.log, options)
             groups = _groups(told, again)
-            weak = contradicted_groups(folds, {key: names for key, names in groups.items() if names})
+            weak = contradicted_groups(
+                folds, {k: names for k, names in groups.items() if names and not told[int(k)].by_priors}
+            )
             needless = [told[int(k)] for k in weak]
             notes += [f"{NOT_CONFIRMED}: {t.statement}" for t in needless]
         if needless:

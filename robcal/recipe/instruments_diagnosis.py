@@ -27,6 +27,7 @@ from robcal.physics.cause import ObservationCause
 from robcal.physics.measuring import WIRE_SCALE
 from robcal.recipe.instruments_delivery import Anew, InstrumentsDiagnosis, Told, delivered
 from robcal.recipe.recording import recording_for_diagnosis
+from robcal.recipe.wire_alarms import scale_by_lengths
 from robcal.recipe.wires import Correction
 from robcal.robot.kernel_cache import kernel_of
 from robcal.robot.model import RobotModel
@@ -37,7 +38,7 @@ CONTRADICTS = 1e-3
 SHOWS = 1e-3
 """Probability of no effect below which an instrument shows a cause, or would show it if it were there."""
 KNOWN = 1e-4
-"""m; a tool whose place is known to this carries the scale of a wire, and so do lengths of links with priors."""
+"""m; a tool whose place is known to this carries the scale of a wire: it shows in the residuals."""
 
 
 def diagnose_instruments(
@@ -69,7 +70,7 @@ def diagnose_instruments(
         case = _case(model, placed, log, against, options)
         if case is None:
             continue
-        if case.recording.hidden:
+        if case.recording.hidden and not _lengths_are_believed(options):
             not_told.append(
                 f"a wrong scale of wire '{name}' cannot be told: neither is its tool's place known nor do lengths of "
                 "the robot have priors, and no instrument that measures more identifies the robot"
@@ -79,6 +80,7 @@ def diagnose_instruments(
         own[name] = diagnose(case.model, case.recording, case.free, case.tied, None, settings or SelectionSettings())
     told = [Told(f, name) for name, d in own.items() for f in d.findings]
     told = _distinct([_compared(t, cases) for t in told])
+    told += [t for n, c in cases.items() if c.recording.hidden and (t := _scale_of(n, c, found, log, options, told))]
     anew = Anew(model, found, instruments, log, options or IdentifyOptions(), corrections or {}, own)
     return delivered(anew, told, tuple(not_told))
 
@@ -105,7 +107,7 @@ def _case(
     if robot is None or recording is None:
         return None
     if placed.instrument.dimension == 1:
-        told = bool(others) or _scale_is_carried(placed.instrument, options)
+        told = bool(others) or max(placed.instrument.tool.sigma[:3]) <= KNOWN
         recording = replace(recording, hidden=() if told else (WIRE_SCALE.name,))
     free, at = robot.names, robot.model
     if others:
@@ -124,10 +126,25 @@ def _case(
     return _Case(at, recording, free, tuple(robot.eliminated))
 
 
-def _scale_is_carried(wire: Instrument, options: IdentifyOptions | None) -> bool:
-    """Whether anything has a known length, so that a wrong scale of the wire shows."""
-    lengths = [n for n in (options.priors if options else {}) if n.rpartition(".")[2] in ("x", "y", "z")]
-    return bool(lengths) or max(wire.tool.sigma[:3]) <= KNOWN
+def _lengths_are_believed(options: IdentifyOptions | None) -> bool:
+    """Whether lengths of the robot have priors, so that a wrong scale of a wire shows in them."""
+    return any(n.rpartition(".")[2] in ("x", "y", "z") for n in (options.priors if options else {}))
+
+
+def _scale_of(
+    name: str,
+    case: _Case,
+    found: IdentifiedInstruments,
+    log: JointLog,
+    options: IdentifyOptions | None,
+    told: Sequence[Told],
+) -> Told | None:
+    """A wrong scale of a wire that leaves no trace in the residuals, where lengths of links with priors tell it."""
+    known = any(t.instrument == name and t.finding.cause.stage == "wire" for t in told)
+    if known or options is None or not _lengths_are_believed(options):
+        return None
+    finding = scale_by_lengths(found, name, case.recording, log, options)
+    return None if finding is None else Told(finding, name, by_priors=True)
 
 
 def _known_errors(model: RobotModel, recording: Recording, names: Sequence[str], covariance: Array) -> Array:

@@ -5,8 +5,6 @@ The robot speaks in the measuring system's frame as it was at the first pose, an
 last one: a slipped gear stays slipped.
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np
@@ -31,16 +29,15 @@ def of_order(term: Term) -> bool:
 def _into(model: RobotModel, term: Term) -> str | None:
     """The zero into which a jump of a joint goes; None where the term is no such thing."""
     frame = next((f for f in model.frames if f.name == term.frame), None)
-    if term.kind != "q" or frame is None or frame.axis is None:
+    if term.kind != "q" or frame is None or not frame.is_joint:
         return None
-    kind = frame.axis if frame.prismatic else {"x": "roll", "y": "pitch", "z": "yaw"}[frame.axis]
-    return f"{term.frame}.{kind}"
+    return frame.zero_name
 
 
 def without_order(model: RobotModel) -> RobotModel:
     """The model without terms that follow the order of the poses; jumps of a joint's zero are in the zero."""
     bound = [term for term in model.terms if of_order(term)]
-    signs = {frame.name: frame.sign for frame in model.frames}
+    signs = {frame.name: frame.zero_sign for frame in model.frames}
     values = dict(model.parameters)
     for term in bound:
         if (zero := _into(model, term)) is not None:
@@ -54,7 +51,7 @@ def covariance_without_order(
     """Names and covariance (p, p) of the parameters of :func:`without_order`'s model."""
     bound = [term for term in model.terms if of_order(term)]
     gone = {name for term in bound for name in term.parameter_names}
-    signs = {frame.name: frame.sign for frame in model.frames}
+    signs = {frame.name: frame.zero_sign for frame in model.frames}
     stay = tuple(name for name in names if name not in gone)
     A = np.array([[float(a == b) for b in names] for a in stay])
     for term in bound:

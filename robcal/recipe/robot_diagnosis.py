@@ -272,7 +272,7 @@ def own_elasticities(found: IdentifiedRobot) -> tuple[str, ...]:
     """
     if found.options.parameters != "standard":
         return ()
-    own = {f"{joint.name}.elastic_{joint.joint_kind}" for joint in found.model.joints if not joint.prismatic}
+    own = {joint.elastic_name for joint in found.model.joints if not joint.prismatic}
     return tuple(name for name in found.rejected_elasticities if name in own)
 
 
@@ -284,7 +284,7 @@ def optional_parameters(found: IdentifiedRobot) -> tuple[str, ...]:
     """
     if found.options.parameters != "standard":
         return ()
-    own = {f"{joint.name}.elastic_{joint.joint_kind}" for joint in found.model.joints if not joint.prismatic}
+    own = {joint.elastic_name for joint in found.model.joints if not joint.prismatic}
     cross = tuple(name for name in found.names if ".elastic_" in name and name not in own)
     frames = {frame.name for frame in found.model.frames}
     free = [name.rsplit(".", 1)[0] in frames and ".elastic_" not in name for name in found.names]

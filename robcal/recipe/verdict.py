@@ -12,7 +12,7 @@ from robcal.calibration.verdict import Deviation, Facts
 from robcal.calibration.verification import Verification
 from robcal.physics.library import kinds
 from robcal.recipe.identification import Identification
-from robcal.robot.model import ELASTIC_KINDS, GEOMETRIC_KINDS
+from robcal.robot.model import GEOMETRIC_KINDS
 from robcal.transforms import log_so3
 
 LEVEL = 0.01
@@ -69,7 +69,7 @@ def _negative(robot: CalibratedRobot) -> tuple[Deviation, ...]:
     out = []
     masses = {f"payload.{name}.mass": load.mass for name, load in robot.model.payloads.items()}
     for name, value, sigma in zip(robot.names, robot.theta, robot.sigma, strict=True):
-        if name.rpartition(".")[2] in ELASTIC_KINDS and value < -SURE * sigma:
+        if name.rpartition(".")[2].startswith("elastic_") and value < -SURE * sigma:
             out.append(Deviation(name, float(np.degrees(value) * 1e3), "deg/kNm"))
         elif name in masses and masses[name] + value < -SURE * sigma:
             out.append(Deviation(name, float(masses[name] + value), "kg"))

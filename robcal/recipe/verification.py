@@ -118,8 +118,10 @@ def verify_robot(
                 at_home = with_fitted_cell(robot.kernel, stated.subset(rows), used.select(rows))
                 beside = replace(tested, model=at_home)
                 unstated = verify(beside, stated.subset(kept_out), used.select(kept_out))
-            # the stated uncertainty is that of the robot; faults of the measuring are told apart
-            judged = {name: getattr(recorded, name) for name in ("normalised", "degrees", "p_value", "coverage_95")}
+            # the stated uncertainty is that of the robot as a table of poses states it; faults of the measuring are
+            # told apart, but directions that nobody states are no user's
+            told = recorded if unstated is None else unstated
+            judged = {name: getattr(told, name) for name in ("normalised", "degrees", "p_value", "coverage_95")}
             outcome = replace(outcome, **judged)
             notes = [*notes, "uncertainties are judged without the faults of the measuring system that were found"]
     return RobotVerification(outcome, recorded, kept_out, tuple(notes), unstated, bool(foreign))

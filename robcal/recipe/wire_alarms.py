@@ -8,6 +8,7 @@ the wire has to explain it better than the links do.
 from collections.abc import Mapping
 
 import numpy as np
+from scipy import stats
 
 from robcal.calibration.calibrated import CalibratedRobot
 from robcal.calibration.identification import IdentifyOptions
@@ -15,9 +16,13 @@ from robcal.calibration.instruments import IdentifiedInstruments
 from robcal.calibration.instruments.linearised import LinearInstruments, linearised
 from robcal.calibration.joint_log import JointLog
 from robcal.calibration.wire import LIMITS
-from robcal.diagnosis.core.fitting import solve
+from robcal.diagnosis.core.recording import Recording, observation_data
+from robcal.diagnosis.core.result import Finding
 from robcal.estimation.covariance import cofactor
-from robcal.physics.cause import DEVIATION
+from robcal.estimation.minimum_norm import solve
+from robcal.physics.cause import DEVIATION, numeric_sigma
+from robcal.physics.measuring import WIRE_SCALE, measuring_causes
+from robcal.robot.kernel_cache import kernel_of
 
 USUAL_LENGTH = 2e-4
 """m; deviation of a link that is usual. Less than that is no reason for an alarm."""
@@ -25,6 +30,8 @@ BELIEVED_LENGTH = 6e-4
 """m; standard deviation of the lengths of links where the campaign states none (`model.priors`)."""
 SURE = 3.5
 """Standard deviations from which something is told: in a few of a thousand faultless campaigns."""
+CERTAIN = 4.0
+"""Standard deviations from which a wrong scale is not only an alarm but put right."""
 WORDS: Mapping[str, str] = {
     "radius": "runs over a pulley",
     "sag": "sags",
@@ -47,8 +54,9 @@ def wire_alarms(found: IdentifiedInstruments, log: JointLog, options: IdentifyOp
         return []
     options = options or IdentifyOptions()
     links = _links(robot)
-    believed = {n: options.priors.get(n, BELIEVED_LENGTH) for n in links}
-    far = [n for n in links if abs(robot.values[n]) - USUAL_LENGTH > SURE * np.hypot(_sigma(robot, n), believed[n])]
+    # without a stated prior a link may be off by anything: robots of old drawings are
+    stated = {n: options.priors[n] for n in links if n in options.priors}
+    far = [n for n in stated if abs(robot.values[n]) - USUAL_LENGTH > SURE * np.hypot(_sigma(robot, n), stated[n])]
     told = [f"{n} {1e3 * robot.values[n]:+.2f} +- {1e3 * _sigma(robot, n):.2g} mm" for n in far]
     reason = f"links are off by more than links may be ({', '.join(told)}), which a fault of the wire does"
     best = 0.0
@@ -58,8 +66,8 @@ def wire_alarms(found: IdentifiedInstruments, log: JointLog, options: IdentifyOp
                 continue
             name = f"{placed.instrument.name}.wire.{kind}"
             linear = linearised(found, log, options, {placed.instrument.name: (kind,)})
-            strength, moved = _explained(linear, name, robot, options)
-            strength /= max(robot.sigma0, 1.0)
+            value, sigma, moved = explained(linear, name, robot, options)
+            strength = abs(value) / (sigma * max(robot.sigma0, 1.0))
             if strength > max(SURE, best) and moved:
                 best = strength
                 reason = f"a wire that {WORDS[kind]} explains it better than links that are off: " + ", ".join(
@@ -69,6 +77,45 @@ def wire_alarms(found: IdentifiedInstruments, log: JointLog, options: IdentifyOp
     if not far and best == 0.0:
         return []
     return [f"identified from wires alone: {reason}; verify in 6D before driving with this robot"]
+
+
+def scale_by_lengths(
+    found: IdentifiedInstruments, name: str, recording: Recording, log: JointLog, options: IdentifyOptions
+) -> Finding | None:
+    """A wrong scale of a wire, told by what is believed of the lengths of links; None where it is not certain.
+
+    Parameters
+    ----------
+    name : of the instrument. recording : its measurements as the diagnosis takes them.
+    """
+    robot = found.placed[name].robot
+    if robot is None:
+        return None
+    linear = linearised(found, log, options, {name: ("scale",)})
+    value, sigma, _ = explained(linear, f"{name}.wire.scale", robot, options)
+    sigma *= max(robot.sigma0, 1.0)
+    if abs(value) < CERTAIN * sigma:
+        return None
+    kernel = kernel_of(robot.model, options.statics)
+    inputs = recording.inputs(kernel)
+    frames, variables = kernel.frames(kernel.theta0, inputs), kernel.variables(kernel.theta0, inputs)
+    causes = measuring_causes(observation_data(recording, frames, variables), (), "")
+    cause = next(c for c in causes if c.kind is WIRE_SCALE)
+    values, covariance = np.array([value]), np.array([[sigma**2]])
+    reported, spread = numeric_sigma(cause.report, values, {}, covariance)
+    strength = abs(value) / sigma
+    return Finding(
+        cause,
+        {},
+        values,
+        covariance,
+        reported,
+        sigma=spread,
+        p_value=2.0 * float(stats.norm.sf(strength)),
+        log_evidence=0.5 * strength**2 - float(np.log(max(cause.priors[0] / sigma, 1.0))),
+        heldout=(float("nan"), float("nan")),
+        statement=cause.describe(reported),
+    )
 
 
 def _links(robot: CalibratedRobot) -> list[str]:
@@ -81,11 +128,11 @@ def _sigma(robot: CalibratedRobot, name: str) -> float:
     return float(robot.sigma[robot.names.index(name)])
 
 
-def _explained(
+def explained(
     linear: LinearInstruments, name: str, robot: CalibratedRobot, options: IdentifyOptions
-) -> tuple[float, dict[str, float]]:
-    """By how many standard deviations a parameter of a wire differs from nothing beside links as they are believed, and
-    the changes (m) of those lengths that it takes further than what is usual."""
+) -> tuple[float, float, dict[str, float]]:
+    """Change and standard deviation (SI) of a parameter of a wire beside links as they are believed, and the changes
+    (m) of those lengths that it takes further than what is usual."""
     rows = [linear.jacobian.reshape(-1, len(linear.names)), linear.prior]
     left = [linear.residual.ravel(), linear.prior_residual]
     for k, (n, value) in enumerate(zip(linear.names, linear.values, strict=True)):
@@ -100,7 +147,7 @@ def _explained(
     sigma = float(np.sqrt(cofactor(J)[at, at]))
     change = dict(zip(linear.names, with_it - without, strict=True))
     moved = {n: float(change[n]) for n in _links(robot) if abs(change[n]) > USUAL_LENGTH}
-    return abs(float(with_it[at])) / sigma, moved
+    return float(with_it[at]), sigma, moved
 
 
 def _believed(name: str, robot: CalibratedRobot, options: IdentifyOptions) -> float:

@@ -5,16 +5,21 @@ before and after it) is a screw about a line that stands still while the joints 
 ``base_T_flange = E_1(q_1) ... E_N(q_N) M`` (product of exponentials; Murray, Li, Sastry 1994, section 3.2), the form in
 which inverse kinematics sees the structure of a robot whatever parametrisation its file uses.
 
+Frames that turn by the angles of several joints or by a four-bar (:mod:`robcal.robot.loops`) are lines as well; their
+angles ``u`` follow from q by the chain's coupling, and the Jacobian is that of the lines times ``du/dq``.
+
 Only nominal geometry lives here. Deviations, elasticities and terms are the kernel's business.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from robcal.errors import InvalidInput
-from robcal.robot.model import RobotModel
+from robcal.robot.loops import Coupling, FourBar
+from robcal.robot.model import Frame, RobotModel
 from robcal.transforms import Array, frame_from_xyzrpy, rotation_from_rpy, skew
 
 
@@ -26,12 +31,15 @@ class Chain:
     ----------
     names : names of the joint frames.
     prismatic : (N,) sliding joints.
-    axes : (N, 3) unit directions of positive q (``sign`` included).
-    points : (N, 3) a point on each line, m (the origin of the joint's frame at zero).
-    home : (4, 4) base_T_flange at zero.
-    frames_home : (F, 4, 4) base_T_frame of every frame of the model at zero.
-    moved_by : (F,) index of the last joint that moves each frame, -1 for those that stand still.
+    axes : (L, 3) unit directions of positive q (``sign`` included); L = N lines unless the chain has loops.
+    points : (L, 3) a point on each line, m (the origin of the line's frame at zero).
+    home : (4, 4) base_T_flange with all lines at zero.
+    frames_home : (F, 4, 4) base_T_frame of every frame of the model with all lines at zero.
+    moved_by : (F,) index of the last line that moves each frame, -1 for those that stand still.
     lower, upper : (N,) limits in rad or m, -inf and inf where unknown.
+    coupling : of chains with loops, how the lines turn with the joints; None where each line is a joint.
+    sliding : (L,) lines that slide; given with a coupling.
+    own_line : (N,) index of each joint's own line; given with a coupling.
     """
 
     names: tuple[str, ...]
@@ -43,17 +51,38 @@ class Chain:
     moved_by: NDArray[np.int_]
     lower: Array
     upper: Array
+    coupling: Coupling | None = None
+    sliding: NDArray[np.bool_] | None = None
+    own_line: NDArray[np.int_] | None = None
 
     @property
     def n_joints(self) -> int:
         """Number of joints."""
         return len(self.names)
 
+    @property
+    def line_slides(self) -> NDArray[np.bool_]:
+        """(L,) lines that slide."""
+        return self.prismatic if self.sliding is None else self.sliding
+
+    @property
+    def line_of_joint(self) -> NDArray[np.int_]:
+        """(N,) index of each joint's own line."""
+        return np.arange(self.n_joints) if self.own_line is None else self.own_line
+
+    def line_angles(self, q: Array) -> Array:
+        """Angles (or ways) of all lines (n, L) at joint values (n, N)."""
+        return q if self.coupling is None else self.coupling.angles(q)
+
+    def closes(self, q: Array) -> NDArray[np.bool_]:
+        """(n,) whether the chain's loops close at joint values (n, N)."""
+        return np.ones(len(q), dtype=bool) if self.coupling is None else self.coupling.closes(q)
+
 
 def chain_of(model: RobotModel) -> Chain:
     """Joint lines of the nominal geometry of a model (its parameters and terms are ignored)."""
     T = np.eye(4)
-    names, prismatic, axes, points, frames, moved_by, lower, upper = [], [], [], [], [], [], [], []
+    axes, points, frames, moved_by, lines = [], [], [], [], []
     for f in model.frames:
         parent = T
         T = parent @ frame_from_xyzrpy([*f.xyz, *f.rpy])
@@ -65,26 +94,40 @@ def chain_of(model: RobotModel) -> Chain:
                 roll, pitch, yaw = f.rpy
                 turned = {"z": (0.0, 0.0, 0.0), "y": (0.0, 0.0, yaw), "x": (roll, pitch, yaw)}[f.axis]
                 local = rotation_from_rpy(turned) @ local
-            names.append(f.name)
-            prismatic.append(f.prismatic)
             axes.append(f.sign * (parent[:3, :3] @ local))
             points.append(T[:3, 3])
-            low, high = f.limits if f.limits is not None else (-np.inf, np.inf)
-            lower.append(low)
-            upper.append(high)
+            lines.append(f)
         frames.append(T)
-        moved_by.append(len(names) - 1)
+        moved_by.append(len(lines) - 1)
+    joints = model.joints
+    limits = np.array([f.limits if f.limits is not None else (-np.inf, np.inf) for f in joints], dtype=float)
     return Chain(
-        tuple(names),
-        np.array(prismatic, bool),
+        tuple(f.name for f in joints),
+        np.array([f.prismatic for f in joints], bool),
         np.array(axes),
         np.array(points),
         T,
         np.array(frames),
         np.array(moved_by),
-        np.array(lower),
-        np.array(upper),
+        limits[:, 0],
+        limits[:, 1],
+        *((None, None, None) if not model.has_loops else _couplings(lines)),
     )
+
+
+def _couplings(lines: Sequence[Frame]) -> tuple[Coupling, NDArray[np.bool_], NDArray[np.int_]]:
+    """Coupling of moving frames, which of them slide, and the line of each joint."""
+    own = np.array([i for i, f in enumerate(lines) if f.is_joint])
+    matrix = np.zeros((len(lines), len(own)))
+    matrix[own, np.arange(len(own))] = 1.0
+    bars: list[tuple[int, FourBar]] = []
+    for i, f in enumerate(lines):
+        for k, coefficient in f.follows:
+            matrix[i, k] = f.sign * coefficient  # the line has the sign in its direction
+        if f.fourbar is not None:
+            matrix[i] = 0.0
+            bars.append((i, f.fourbar))
+    return Coupling(matrix, tuple(bars)), np.array([f.prismatic for f in lines], bool), own
 
 
 def check_joint_angles(chain: Chain, q: ArrayLike) -> Array:
@@ -104,14 +147,14 @@ def check_joint_angles(chain: Chain, q: ArrayLike) -> Array:
 
 
 def line_motions(chain: Chain, q: Array) -> Array:
-    """Exponentials ``E_i(q_i)`` of all joints, shape (n, N, 4, 4), for joint values (n, N)."""
+    """Exponentials ``E_i(u_i)`` of all lines, shape (n, L, 4, 4), of line angles (n, L) (without loops: q)."""
     n, count = q.shape
     out = np.zeros((n, count, 4, 4))
     out[..., 3, 3] = 1.0
     W = skew(chain.axes)
     c, s = np.cos(q)[..., None, None], np.sin(q)[..., None, None]
     turn = np.eye(3) + s * W + (1.0 - c) * (W @ W)
-    slide = chain.prismatic[:, None]
+    slide = chain.line_slides[:, None]
     out[..., :3, :3] = np.where(slide[..., None], np.eye(3), turn)
     about = chain.points - np.einsum("nkij,kj->nki", turn, chain.points)
     out[..., :3, 3] = np.where(slide, q[..., None] * chain.axes, about)
@@ -119,11 +162,11 @@ def line_motions(chain: Chain, q: Array) -> Array:
 
 
 def cumulative_motions(chain: Chain, q: Array) -> Array:
-    """``E_1 ... E_i`` for i = 0 (identity) to N, shape (n, N + 1, 4, 4)."""
-    E = line_motions(chain, q)
-    out = np.empty((len(q), chain.n_joints + 1, 4, 4))
+    """``E_1 ... E_i`` for i = 0 (identity) to L, shape (n, L + 1, 4, 4), for joint values (n, N)."""
+    E = line_motions(chain, chain.line_angles(q))
+    out = np.empty((len(q), len(chain.axes) + 1, 4, 4))
     out[:, 0] = np.eye(4)
-    for i in range(chain.n_joints):
+    for i in range(len(chain.axes)):
         out[:, i + 1] = out[:, i] @ E[:, i]
     return out
 
@@ -148,11 +191,12 @@ def forward_and_jacobian(chain: Chain, q: ArrayLike) -> tuple[Array, Array]:
     axes = np.einsum("nkij,kj->nki", before[..., :3, :3], chain.axes)
     points = np.einsum("nkij,kj->nki", before[..., :3, :3], chain.points) + before[..., :3, 3]
     turning = np.cross(axes, T[:, None, :3, 3] - points)
-    slide = chain.prismatic[:, None]
+    slide = chain.line_slides[:, None]
     linear = np.where(slide, axes, turning)
     angular = np.where(slide, 0.0, axes)
     twist = np.concatenate([linear @ T[:, :3, :3], angular @ T[:, :3, :3]], axis=-1)
-    return T, np.swapaxes(twist, 1, 2)
+    lines = np.swapaxes(twist, 1, 2)
+    return T, lines if chain.coupling is None else lines @ chain.coupling.slopes(values)
 
 
 def limit_excess(chain: Chain, q: Array) -> Array:

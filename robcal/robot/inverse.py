@@ -292,6 +292,8 @@ def carried_arm(chain: Chain) -> tuple[Chain | None, int]:
 
     The track (a sliding first joint under six rotary ones) is taken at zero; None where the chain is of another kind.
     """
+    if chain.coupling is not None:
+        return None, 0
     if chain.n_joints != 7 or not chain.prismatic[0] or bool(np.any(chain.prismatic[1:])):
         return (chain, 0) if chain.n_joints == 6 else (None, 0)
     arm = Chain(

@@ -126,7 +126,7 @@ def search(chain: Chain, base_T_flange: Array, near: Array, settings: NumericSet
     """
     n, count = len(base_T_flange), chain.n_joints
     q, r = refine(chain, base_T_flange, near, settings)
-    solved = settings.reached(chain, r)
+    solved = settings.reached(chain, r) & chain.closes(q)
     inside = np.all((q >= chain.lower - 1e-9) & (q <= chain.upper + 1e-9), axis=1)
     rows = np.arange(n) if all_branches else np.flatnonzero(~(solved & inside))
     found: list[list[Array]] = [[q[i]] if solved[i] else [] for i in range(n)]
@@ -134,7 +134,7 @@ def search(chain: Chain, base_T_flange: Array, near: Array, settings: NumericSet
         starts = start_configurations(chain, settings.starts)
         many = np.repeat(rows, len(starts))
         q_many, r_many = refine(chain, base_T_flange[many], np.tile(starts, (len(rows), 1)), settings)
-        good = settings.reached(chain, r_many)
+        good = settings.reached(chain, r_many) & chain.closes(q_many)
         for i, solution in zip(many[good], q_many[good], strict=True):
             if not any(_same(chain, solution, known) for known in found[i]):
                 found[i].append(solution)

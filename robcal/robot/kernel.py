@@ -211,20 +211,20 @@ class Kernel:
         (flat,) = self._evaluate("basis", theta, poses)
         frames = ["base", *(f.name for f in self.model.frames), "tool"]
         names = [f"{frame}.{kind}" for frame in frames for kind in GEOMETRIC_KINDS]
+        names += [f"{f.name}.crank_angle" for f in self.model.frames if f.fourbar is not None]
         J = flat.reshape(len(poses), len(names), 6).transpose(0, 2, 1)
-        joints = [(names.index(f"{f.name}.{f.joint_kind}"), f.sign, f"{f.name}.q") for f in self.model.joints]
+        joints = [(names.index(f.zero_name), f.zero_sign, f"{f.name}.q") for f in self.model.joints]
         of_joints = J[:, :, [k for k, _, _ in joints]] * np.array([s for _, s, _ in joints], dtype=float)
         return ScanBasis((*names, *(n for _, _, n in joints)), np.concatenate([J, of_joints], axis=2))
 
     def variables(self, theta: ArrayLike, poses: PoseInputs) -> dict[str, Array]:
         """All variables of the expression language, (n,) each: q, moments, torques, payload mass, covariates."""
-        (flat,) = self._evaluate("moments", theta, poses)
+        flat, torques = self._evaluate("moments", theta, poses)
         names = moment_names(self.model)
         out: dict[str, Array] = {name: flat[:, k] for k, name in enumerate(names)}
-        for k, f in enumerate(self.model.joints):
+        for k in range(self.model.n_joints):
             out[f"q{k + 1}"] = poses.q[:, k]
-            own = f"{identifier(f.name)}_force" if f.prismatic else f"{identifier(f.name)}_m{f.joint_kind}"
-            out[f"torque{k + 1}"] = f.sign * out[own]
+            out[f"torque{k + 1}"] = torques[:, k]
             out[f"approach{k + 1}"] = out[f"move{k + 1}"] = np.zeros(len(poses))
         masses = [p.mass + np.asarray(theta)[self.index[f"payload.{n}.mass"]] for n, p in self.model.payloads.items()]
         out["payload_mass"] = poses.load @ np.array(masses) if masses else np.zeros(len(poses))
@@ -246,7 +246,7 @@ class Kernel:
 
     def function(self, kind: str = "frames") -> ca.Function:
         """CasADi function of one pose: 'frames', 'jacobian' (frames, Jacobian, moments), 'joint_jacobian', 'basis' or
-        'moments'.
+        'moments' (moments, torques of the joints).
 
         Inputs: theta, q, load, covariates, world_T_base (3, 4), flange_T_tool (3, 4).
         """
@@ -257,7 +257,7 @@ class Kernel:
                 "jacobian": [g.world_T_tool, g.jacobian, g.moments],
                 "joint_jacobian": [g.joint_jacobian],
                 "basis": [g.basis],
-                "moments": [g.moments],
+                "moments": [g.moments, g.torques],
             }[kind]
             self._functions[kind] = ca.Function(f"robot_{kind}", g.inputs, [ca.densify(o) for o in outputs])
         return self._functions[kind]

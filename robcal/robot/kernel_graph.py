@@ -6,6 +6,10 @@ D directly and S dm by way of the moments. So ``J = G D + (G S) dm/dtheta``: onl
 automatic differentiation, G and the moments' derivatives from mechanics. That keeps the graph ten times smaller than
 differentiating the chain.
 
+Where joints turn further frames (:mod:`robcal.robot.loops`), the coordinates c follow from free ones by the joints'
+true angles, deviations and elasticities included. A joint then carries, by virtual work, the moments of all frames that
+it turns, each times the slope of the coupling; four-bars take it at the undeflected angle.
+
 Statics 'one_step': moments of the undeflected chain. 'converged': the fixed
 point, unrolled; each round gains the factor elasticity * load, about 1e-2 for soft robots.
 """
@@ -15,7 +19,8 @@ from dataclasses import dataclass
 import casadi as ca
 
 from robcal.errors import InvalidInput
-from robcal.robot.model import ELASTIC_KINDS, GEOMETRIC_KINDS, RobotModel, parameter_names
+from robcal.robot.loops import FOUR_BAR_LENGTHS, rocker_angle
+from robcal.robot.model import ELASTIC_KINDS, GEOMETRIC_KINDS, Frame, RobotModel, parameter_names
 from robcal.robot.statics import StaticChain, local_frame, moment_names, moment_sweep, moments, static_chain
 from robcal.robot.terms import graph, identifier, names_in
 
@@ -32,8 +37,10 @@ class PoseGraph:
     inputs : theta, q (sense of q), load (one-hot over payloads), covariates, world_T_base (12,), flange_T_tool (12,).
     covariates : names of the covariates that the terms need, in order.
     world_T_tool : (3, 4).
-    jacobian : (6, p) by all parameters; joint_jacobian (6, N); basis (6, coordinates): tool twist per coordinate.
+    jacobian : (6, p) by all parameters; joint_jacobian (6, N).
+    basis : (6, coordinates) tool twist per coordinate of base, frames and tool, and per crank angle of each four-bar.
     moments : entries as :func:`robcal.robot.statics.moment_names`.
+    torques : (N,) what the weights exert on each joint, in the sense of q.
     """
 
     inputs: list[ca.SX]
@@ -43,6 +50,7 @@ class PoseGraph:
     joint_jacobian: ca.SX
     basis: ca.SX
     moments: ca.SX
+    torques: ca.SX
 
 
 def pose_graph(model: RobotModel, statics: str = "one_step", derivatives: bool = True) -> PoseGraph:
@@ -57,7 +65,9 @@ def pose_graph(model: RobotModel, statics: str = "one_step", derivatives: bool =
     x = _Inputs.of(model)
     pull = _Pull.of(model, x)
     m = ca.SX.sym("m", len(moment_names(model)))
-    coordinates = _coordinates(model, x, m, pull.mass)
+    torques, on_cranks = _torques(model, x, m)
+    free = _coordinates(model, x, m, (torques, on_cranks), pull.mass)
+    coordinates = _coupled(model, x, free)
     at_rest = ca.substitute(coordinates, m, ca.SX.zeros(m.shape))
     chain = pull.chain(at_rest)
     moment = moments(model, chain)
@@ -71,7 +81,7 @@ def pose_graph(model: RobotModel, statics: str = "one_step", derivatives: bool =
     world_T_tool = ca.horzcat(tool.tool_R_world.T, -ca.mtimes(tool.tool_R_world.T, tool.world_origin))
     if not derivatives:
         empty = ca.SX()
-        return PoseGraph(x.all, x.covariate_names, world_T_tool, empty, empty, empty, moment)
+        return PoseGraph(x.all, x.covariate_names, world_T_tool, empty, empty, empty, moment, empty)
     G = tool.columns
     unknowns = ca.vertcat(x.theta, x.q)
     D = ca.jacobian(coordinates, unknowns)
@@ -90,8 +100,11 @@ def pose_graph(model: RobotModel, statics: str = "one_step", derivatives: bool =
                 K, L = pull.feedback(chain, base_six, ca.mtimes(basis, S), unknowns.numel())
                 basis = G + K
             J = ca.mtimes(basis, D) + L
+    if model.has_loops:  # a joint's coordinate takes along the frames that it turns
+        basis = ca.mtimes(basis, ca.substitute(_propagation(model, x, free), m, moment))
     p = x.theta.numel()
-    return PoseGraph(x.all, x.covariate_names, world_T_tool, J[:, :p], J[:, p:], basis, moment)
+    torques = ca.substitute(torques, m, moment)
+    return PoseGraph(x.all, x.covariate_names, world_T_tool, J[:, :p], J[:, p:], basis, moment, torques)
 
 
 @dataclass(frozen=True)
@@ -216,44 +229,131 @@ def _gravity(model: RobotModel, theta: ca.SX, index: dict[str, int]) -> tuple[ca
     return g, {tilt[0]: by_x, tilt[1]: by_y}
 
 
-def _coordinates(model: RobotModel, x: _Inputs, m: ca.SX, load_mass: ca.SX) -> ca.SX:
-    """Six coordinates of base, every frame, and tool; the moments enter as symbols."""
+def _coordinates(
+    model: RobotModel, x: _Inputs, m: ca.SX, loads: tuple[ca.SX, dict[str, ca.SX]], load_mass: ca.SX
+) -> ca.SX:
+    """Free coordinates: six of base, every frame, and tool, then the crank angle of each four-bar.
+
+    ``loads``: torques of the joints and on the cranks, as graphs of the moments m. What joints turn besides their own
+    frame is not in yet.
+    """
     theta, q, index = x.theta, x.q, x.index
+    torques, on_cranks = loads
     at = {"base": 0, "tool": 6 * (len(model.frames) + 1)} | {f.name: 6 * (i + 1) for i, f in enumerate(model.frames)}
     values: list[ca.SX] = [theta[index[f"base.{k}"]] for k in GEOMETRIC_KINDS]
+    cranks: dict[str, ca.SX] = {}
     joint = 0
     for i, f in enumerate(model.frames):
+        direct = f.is_joint and f.fourbar is None
         for k, (kind, nominal) in enumerate(zip(GEOMETRIC_KINDS, (*f.xyz, *f.rpy), strict=True)):
             value = nominal + theta[index[f"{f.name}.{kind}"]]
-            if kind == f.joint_kind:
+            moment = m[3 + 3 * i + k - 3] if k >= 3 else ca.SX(0)
+            if direct and kind == f.joint_kind:
                 value = value + f.sign * q[joint]
+                moment = f.sign * torques[joint]
             if k >= 3:
-                value = value + theta[index[f"{f.name}.{ELASTIC_KINDS[k - 3]}"]] * m[3 + 3 * i + k - 3]
+                value = value + theta[index[f"{f.name}.{ELASTIC_KINDS[k - 3]}"]] * moment
             values.append(value)
-        joint += f.axis is not None
+        if f.fourbar is not None:
+            own = q[joint] if f.is_joint else ca.SX(0)
+            gives = theta[index[f"{f.name}.elastic_crank"]] * on_cranks[f.name]
+            cranks[f.name] = f.fourbar.crank_zero + theta[index[f"{f.name}.crank_angle"]] + gives + own
+        joint += f.is_joint
     values += [theta[index[f"tool.{k}"]] for k in GEOMETRIC_KINDS]
 
     if model.terms:
         covariates = {name: x.covariates[k] for k, name in enumerate(x.covariate_names)}
-        symbols = _symbols(model, q, m, load_mass) | covariates
+        symbols = _symbols(model, q, m, torques, load_mass) | covariates
         for term in model.terms:
-            own = {short: theta[index[f"{term.name}.{short}"]] for short in term.parameters}
-            value = graph(term.expression, {**symbols, **own})
+            own_values = {short: theta[index[f"{term.name}.{short}"]] for short in term.parameters}
+            value = graph(term.expression, {**symbols, **own_values})
             kind = term.kind
             if kind == "q":
                 f = model.frame(term.frame)
+                if f.fourbar is not None:
+                    cranks[f.name] += value
+                    continue
                 kind, value = str(f.joint_kind), f.sign * value
             values[at[term.frame] + _SIX[kind]] += value
-    return ca.vertcat(*values)
+    return ca.vertcat(*values, *cranks.values())
 
 
-def _symbols(model: RobotModel, q: ca.SX, m: ca.SX, load_mass: ca.SX) -> dict[str, ca.SX]:
+def _coupled(model: RobotModel, x: _Inputs, free: ca.SX) -> ca.SX:
+    """Six coordinates of base, every frame, and tool: the free ones, and what the joints turn along."""
+    size = 6 * (len(model.frames) + 2)
+    if not model.has_loops:
+        return free
+    out = free[:size]
+    cranks = _crank_rows(model)
+    turned: list[ca.SX] = []  # true angle of each joint in the sense of q
+    for i, f in enumerate(model.frames):
+        if f.is_joint:
+            k = GEOMETRIC_KINDS.index(str(f.joint_kind))
+            plain = f.sign * (free[6 * (i + 1) + k] - (*f.xyz, *f.rpy)[k])
+            turned.append(plain if f.fourbar is None else free[cranks[f.name]] - f.fourbar.crank_zero)
+    for i, f in enumerate(model.frames):
+        if not f.in_loop:
+            continue
+        row = 6 * (i + 1) + GEOMETRIC_KINDS.index(str(f.joint_kind))
+        for k, coefficient in f.follows:
+            out[row] += coefficient * turned[k]
+        if f.fourbar is not None:
+            phi = free[cranks[f.name]] + (ca.SX(0) if f.is_joint else turned[f.fourbar.driver])
+            out[row] += f.sign * rocker_angle(f.fourbar, phi, _lengths(x, f))
+    return out
+
+
+def _propagation(model: RobotModel, x: _Inputs, free: ca.SX) -> ca.SX:
+    """Derivative of all coordinates by the free ones."""
+    symbols = ca.SX.sym("free", free.shape)
+    return ca.substitute(ca.jacobian(_coupled(model, x, symbols), symbols), symbols, free)
+
+
+def _crank_rows(model: RobotModel) -> dict[str, int]:
+    """Row of each four-bar's crank angle among the free coordinates, by the name of its frame."""
+    driven = [f.name for f in model.frames if f.fourbar is not None]
+    return {name: 6 * (len(model.frames) + 2) + k for k, name in enumerate(driven)}
+
+
+def _lengths(x: _Inputs, f: Frame) -> ca.SX:
+    """Crank, coupler, rocker and ground with their deviations."""
+    own = [x.theta[x.index[f"{f.name}.{kind}"]] for kind in FOUR_BAR_LENGTHS]
+    nominal = f.fourbar.lengths if f.fourbar is not None else ()
+    return ca.vertcat(*(length + deviation for length, deviation in zip(nominal, own, strict=True)))
+
+
+def _torques(model: RobotModel, x: _Inputs, m: ca.SX) -> tuple[ca.SX, dict[str, ca.SX]]:
+    """What the weights exert on each joint (N,), in the sense of q: the moments of all frames that it turns; and what
+    they exert on the crank of each four-bar."""
     names = moment_names(model)
-    symbols = {name: m[k] for k, name in enumerate(names)}
-    for k, f in enumerate(model.joints):
-        symbols[f"q{k + 1}"] = q[k]
+    torques: list[ca.SX] = []
+    offsets: list[ca.SX] = []
+    on_cranks: dict[str, ca.SX] = {}
+    for f in model.joints:
         own = f"{identifier(f.name)}_force" if f.prismatic else f"{identifier(f.name)}_m{f.joint_kind}"
-        symbols[f"torque{k + 1}"] = f.sign * m[names.index(own)]
+        torques.append(ca.SX(0) if f.fourbar is not None else f.sign * m[names.index(own)])
+        offsets.append(ca.SX(0) if f.fourbar is not None else f.sign * x.theta[x.index[f.zero_name]])
+    for f in model.frames:
+        if not f.in_loop:
+            continue
+        moment = m[names.index(f"{identifier(f.name)}_m{f.joint_kind}")]
+        for k, coefficient in f.follows:
+            torques[k] += coefficient * moment
+        if f.fourbar is not None:
+            k = f.fourbar.driver
+            phi = ca.SX.sym("phi")
+            slope = ca.jacobian(rocker_angle(f.fourbar, phi, _lengths(x, f)), phi)
+            at = f.fourbar.crank_zero + x.theta[x.index[f"{f.name}.crank_angle"]] + x.q[k] + offsets[k]
+            on_cranks[f.name] = f.sign * ca.substitute(slope, phi, at) * moment
+            torques[k] += on_cranks[f.name]
+    return ca.vertcat(*torques), on_cranks
+
+
+def _symbols(model: RobotModel, q: ca.SX, m: ca.SX, torques: ca.SX, load_mass: ca.SX) -> dict[str, ca.SX]:
+    symbols = {name: m[k] for k, name in enumerate(moment_names(model))}
+    for k in range(model.n_joints):
+        symbols[f"q{k + 1}"] = q[k]
+        symbols[f"torque{k + 1}"] = torques[k]
     symbols["payload_mass"] = load_mass
     return symbols
 

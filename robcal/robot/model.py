@@ -5,6 +5,7 @@ Nothing is computed here; :mod:`robcal.robot.kernel` turns a model into an expre
 Parameter names (deviations from nominal, metres, radians, rad/(N m), kg):
 
 - ``<frame>.<x|y|z|roll|pitch|yaw>`` and ``<frame>.elastic_<roll|pitch|yaw>`` for every frame of the chain,
+- ``<frame>.<crank|coupler|rocker|ground|crank_angle|elastic_crank>`` for every frame that a four-bar turns,
 - ``base.<x..yaw>``, ``tool.<x..yaw>``: on the right of the references ``world_T_base`` and ``flange_T_tool``,
 - ``gravity.tilt_x``, ``gravity.tilt_y``: turn of the gravity vector about the x and y axes of the frame it is given in,
 - ``payload.<name>.mass|x|y|z``: deviation of a payload's mass and centre of gravity (flange coordinates),
@@ -20,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robcal.errors import InvalidInput
+from robcal.robot.loops import FOUR_BAR_KINDS, FOUR_BAR_LENGTHS, FourBar
 
 Array = NDArray[np.float64]
 Triple = tuple[float, float, float]
@@ -45,6 +47,9 @@ class Frame:
     limits : lowest and highest q, rad or m; None if unknown.
     xyz, rpy : nominal offset in m and angles in rad, in the parent's coordinates.
     mass : kg, moves with the frame; cog : centre of gravity in this frame's coordinates, m.
+    follows : (joint, coefficient) pairs: the angle about ``axis`` also turns by so much of these joints (from 0).
+    fourbar : the angle about ``axis`` is, times ``sign``, a rocker's whose crank a joint turns, its own or another's.
+    passive : the frame turns by ``follows`` or ``fourbar`` alone, it carries no joint.
     """
 
     name: str
@@ -56,13 +61,41 @@ class Frame:
     rpy: Triple = (0.0, 0.0, 0.0)
     mass: float = 0.0
     cog: Triple = (0.0, 0.0, 0.0)
+    follows: tuple[tuple[int, float], ...] = ()
+    fourbar: FourBar | None = None
+    passive: bool = False
+
+    @property
+    def is_joint(self) -> bool:
+        """Whether the frame carries a joint."""
+        return self.axis is not None and not self.passive
+
+    @property
+    def in_loop(self) -> bool:
+        """Whether other joints, or a four-bar, turn the frame."""
+        return bool(self.follows) or self.fourbar is not None
 
     @property
     def joint_kind(self) -> str | None:
-        """Name of the coordinate that the joint moves: 'roll'..'yaw', 'x'..'z' if prismatic, None if fixed."""
+        """Name of the coordinate that moves: 'roll'..'yaw', 'x'..'z' if prismatic, None if the frame is fixed."""
         if self.axis is None:
             return None
         return self.axis if self.prismatic else ANGLE_OF_AXIS[self.axis]
+
+    @property
+    def zero_name(self) -> str:
+        """Parameter that acts as the joint's zero offset: its own angle or length, of a four-bar the crank's angle."""
+        return f"{self.name}.{'crank_angle' if self.fourbar is not None else self.joint_kind}"
+
+    @property
+    def elastic_name(self) -> str:
+        """Parameter that is the elasticity of the joint's gear, about its own axis."""
+        return f"{self.name}.elastic_{'crank' if self.fourbar is not None else self.joint_kind}"
+
+    @property
+    def zero_sign(self) -> int:
+        """What the parameter ``zero_name`` of one counts in the sense of q."""
+        return 1 if self.fourbar is not None else self.sign
 
 
 @dataclass(frozen=True)
@@ -151,12 +184,17 @@ class RobotModel:
     @property
     def joints(self) -> tuple[Frame, ...]:
         """Frames that carry a joint, in the order of q."""
-        return tuple(f for f in self.frames if f.axis is not None)
+        return tuple(f for f in self.frames if f.is_joint)
 
     @property
     def n_joints(self) -> int:
         """Number of joints."""
         return len(self.joints)
+
+    @property
+    def has_loops(self) -> bool:
+        """Whether frames turn by the angles of other joints or by four-bars."""
+        return any(f.in_loop for f in self.frames)
 
     def joint_of(self, frame_name: str) -> int | None:
         """Index of the joint (0-based) in the named frame; None for a fixed frame."""
@@ -195,11 +233,16 @@ class RobotModel:
         return replace(self, parameters={}, terms=())
 
 
+def frame_kinds(frame: Frame) -> tuple[str, ...]:
+    """Kinds of parameters that a frame has."""
+    return (*GEOMETRIC_KINDS, *ELASTIC_KINDS, *(FOUR_BAR_KINDS if frame.fourbar is not None else ()))
+
+
 def parameter_names(model: RobotModel) -> tuple[str, ...]:
     """All parameter names of a model: base, frames in order, tool, gravity, payloads, terms."""
     names = [f"base.{k}" for k in GEOMETRIC_KINDS]
     for f in model.frames:
-        names += [f"{f.name}.{k}" for k in (*GEOMETRIC_KINDS, *ELASTIC_KINDS)]
+        names += [f"{f.name}.{k}" for k in frame_kinds(f)]
     names += [f"tool.{k}" for k in GEOMETRIC_KINDS]
     names += ["gravity.tilt_x", "gravity.tilt_y"]
     names += [f"payload.{p}.{k}" for p in model.payloads for k in ("mass", "x", "y", "z")]
@@ -219,12 +262,12 @@ def parameter_unit(model: RobotModel, name: str) -> str:
         return "rad/(N m)"
     if kind == "mass":
         return "kg"
-    return "m" if kind in ("x", "y", "z") else "rad"
+    return "m" if kind in ("x", "y", "z", *FOUR_BAR_LENGTHS) else "rad"
 
 
 def _check(model: RobotModel) -> None:
     where = f"robot '{model.name}'"
-    if not any(f.axis is not None for f in model.frames):
+    if not any(f.is_joint for f in model.frames):
         raise InvalidInput(f"{where}: the chain has no joint; give at least one frame an axis x, y or z")
     seen: set[str] = set()
     for f in model.frames:
@@ -235,6 +278,7 @@ def _check(model: RobotModel) -> None:
             )
         seen.add(f.name)
         _check_frame(f, f"{where}, frame {f.name}")
+        _check_loop(model, f, f"{where}, frame {f.name}")
     for name, payload in model.payloads.items():
         if not all(math.isfinite(v) for v in (payload.mass, *payload.cog)) or payload.mass < 0:
             raise InvalidInput(f"{where}, payload '{name}': mass and centre of gravity must be finite, mass >= 0")
@@ -264,6 +308,29 @@ def _check_frame(f: Frame, where: str) -> None:
         raise InvalidInput(f"{where}: mass {f.mass} kg is negative")
     if f.limits is not None and not f.limits[0] <= f.limits[1]:
         raise InvalidInput(f"{where}: the lower limit is above the upper one")
+
+
+def _check_loop(model: RobotModel, f: Frame, where: str) -> None:
+    if not f.in_loop:
+        if f.passive:
+            raise InvalidInput(f"{where}: a passive frame turns by the angles of joints or by a four-bar; give either")
+        return
+    if f.axis is None or f.prismatic:
+        raise InvalidInput(f"{where}: what joints turn needs an axis x, y or z and cannot slide")
+    if f.follows and f.fourbar is not None:
+        raise InvalidInput(f"{where}: turns by joint angles or by a four-bar, not by both")
+    joints = model.joints
+    drivers = [k for k, _ in f.follows] if f.fourbar is None else [f.fourbar.driver]
+    for k in drivers:
+        if not 0 <= k < len(joints):
+            raise InvalidInput(f"{where}: turns with joint q{k + 1}, but the robot has {len(joints)} joints")
+        if joints[k].prismatic:
+            raise InvalidInput(f"{where}: turns with joint q{k + 1} ({joints[k].name}), which slides")
+    own = next((k for k, joint in enumerate(joints) if joint is f), None)
+    if own is not None and ((f.fourbar is None) == (own in drivers)):
+        raise InvalidInput(f"{where}: its joint is q{own + 1}; a four-bar of its own is driven by it, other angles not")
+    if not all(math.isfinite(c) and c != 0.0 for _, c in f.follows):
+        raise InvalidInput(f"{where}: coefficients of joint angles must be finite and not zero")
 
 
 def _check_term(model: RobotModel, term: Term, where: str) -> None:

@@ -56,7 +56,7 @@ def meeting_point(axes: Array, points: Array) -> Array | None:
 
 def find_structure(chain: Chain) -> Structure:
     """The closed-form structure of a chain of six rotary joints, None where only a numeric inverse is known."""
-    if chain.n_joints != 6 or bool(np.any(chain.prismatic)):
+    if chain.n_joints != 6 or bool(np.any(chain.prismatic)) or chain.coupling is not None:
         return None
     w, p = chain.axes, chain.points
     if parallel(w[1], w[2]) and parallel(w[2], w[3]) and not parallel(w[0], w[1]):

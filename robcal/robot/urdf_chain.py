@@ -21,6 +21,8 @@ from robcal.errors import InvalidInput
 from robcal.robot.model import Frame, RobotModel
 from robcal.transforms import Array, frame, invert, rotation_from_rpy, rpy_from_rotation
 
+LARGEST = 1e30
+"""Numbers beyond are no length, angle or mass of a robot."""
 NEGLIGIBLE_MASS = 1e-3
 """kg; lighter links stand for links of unknown mass (simulators refuse links without)."""
 LARGEST_LIMIT = 25.0
@@ -193,11 +195,15 @@ def _step(joint: Any, mass: float, cog: Array) -> UrdfStep:
     if joint.type not in ("revolute", "continuous", "prismatic", "fixed"):
         raise InvalidInput(f"URDF joint '{joint.name}' is of type '{joint.type}'; only single-axis joints form a chain")
     if getattr(joint, "mimic", None) is not None:
-        raise InvalidInput(f"URDF joint '{joint.name}' mimics another one; coupled joints are given as a term instead")
+        raise InvalidInput(
+            f"URDF joint '{joint.name}' mimics another one: describe the robot in a robot.yaml, whose frames may turn "
+            "by the angles of joints ('angle')"
+        )
     origin = np.eye(4) if joint.origin is None else np.asarray(joint.origin, dtype=float)
     axis = np.array([1.0, 0.0, 0.0]) if joint.axis is None else np.asarray(joint.axis, dtype=float)
-    length = float(np.linalg.norm(axis))
-    if not np.all(np.isfinite(origin)) or not (length > 1e-9 or joint.type == "fixed"):
+    measurable = np.all(np.abs(origin) < LARGEST) and np.all(np.abs(axis) < LARGEST)
+    length = float(np.linalg.norm(axis)) if measurable else 0.0
+    if not measurable or not (length > 1e-9 or joint.type == "fixed"):
         raise InvalidInput(f"URDF joint '{joint.name}': origin and axis must be finite, the axis not zero")
     limits = None
     if joint.type in ("revolute", "prismatic") and joint.limit is not None:
@@ -218,6 +224,8 @@ def _inertial(link: Any) -> tuple[float, Array]:
         return 0.0, np.zeros(3)
     origin = np.eye(4) if link.inertial.origin is None else np.asarray(link.inertial.origin, dtype=float)
     mass = float(link.inertial.mass)
+    if not np.all(np.abs([mass, *origin.ravel()]) < LARGEST):
+        raise InvalidInput(f"URDF link '{link.name}': mass and origin of its inertial must be finite")
     return (mass, origin[:3, 3]) if mass > NEGLIGIBLE_MASS else (0.0, np.zeros(3))
 
 

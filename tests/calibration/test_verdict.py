@@ -1,7 +1,5 @@
 """Every rule of the verdict: kept, and broken alone."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """Campaigns with several instruments: from their files to result.json and predict --instrument; truth from fixtures."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any
@@ -15,6 +13,7 @@ from fixtures.plan import Plan
 from pipeline.campaign_reader import read_campaign
 from pipeline.prediction import predict_run
 from pipeline.runner import run_campaign
+from pipeline.stages.identify import options_of
 from robcal.errors import InvalidInput
 from robcal.files.tables import read_table
 
@@ -183,3 +182,28 @@ def test_what_belongs_to_a_wire_is_refused_elsewhere(tmp_path: Path) -> None:
     folder = write_watched(tmp_path, made, {"a": {"tension_N": 5.0}})
     with pytest.raises(InvalidInput, match="'tension_N' belongs to a wire's lengths"):
         read_campaign(folder)
+
+
+@pytest.mark.parametrize(
+    ("priors", "sentence"),
+    [
+        ({"axis9.x_mm": 0.3}, r"campaign.yaml, line \d+: 'axis9\.x_mm' is no length or angle of robot .*did you mean"),
+        ({"axis2.x": 0.3}, r"'axis2\.x' is no length or angle of robot .*did you mean 'axis2\.x_mm'"),
+        ({"lengths_mm": 0.0}, r"model\.priors\.lengths_mm: must be larger than zero"),
+    ],
+)
+def test_priors_of_what_the_robot_does_not_have_are_refused(tmp_path: Path, priors: dict, sentence: str) -> None:
+    made = watch(Plan(seed=5, poses=8, verify=2, kept_out=2), {"a": Watcher()})
+    with pytest.raises(InvalidInput, match=sentence):
+        read_campaign(write_watched(tmp_path, made, model={"priors": priors}))
+
+
+def test_priors_hold_for_all_lengths_and_single_ones(tmp_path: Path) -> None:
+    made = watch(Plan(seed=5, poses=8, verify=2, kept_out=2), {"a": Watcher()})
+    stated = {"axis3.x_mm": 0.1, "lengths_mm": 0.5, "axis2.pitch_deg": 0.02}
+    campaign = read_campaign(write_watched(tmp_path, made, model={"priors": stated}))
+    priors = options_of(campaign, stated=True).priors
+    assert priors["axis3.x"] == pytest.approx(1e-4)
+    assert priors["axis4.z"] == pytest.approx(5e-4)
+    assert priors["axis2.pitch"] == pytest.approx(np.radians(0.02))
+    assert "axis3.pitch" not in priors

@@ -1,7 +1,5 @@
 """Several instruments diagnosed: a fault of a wire is put right; what one shows and another contradicts is its own."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -83,3 +81,20 @@ def test_what_both_instruments_show_is_the_robot(tmp_path: Path) -> None:
     assert (cause["stage"], cause["where"]) == ("robot", "axis1")
     assert len(cause["agreeing"]) == 1
     assert cause["contradicting"] == []
+
+
+@pytest.mark.slow
+def test_lengths_with_priors_carry_the_scale_of_a_wire(tmp_path: Path) -> None:
+    scale = Effect("wire_scale", "wire", parameters={"ppm": 3000.0})
+    wire = Watcher("distances", poses="identify", sigma_mm=0.02, effects=(scale,))
+    made = watch(replace(PLAN, poses=80), {"tracker": Watcher(poses="verify"), "wire": wire})
+    model = {"parameters": list(MODEL), "priors": {"lengths_mm": 0.6}}
+    write_watched(tmp_path / "campaign", made, model=model)
+    run_campaign(tmp_path / "campaign", out=tmp_path / "run", until="diagnose")
+    content = json.loads((tmp_path / "run" / "diagnosis.json").read_text())
+    assert not content["not_told"]
+    # the scale shows as a length that the model holds, too: beside the scale that one does not pay
+    (cause,) = [c for c in content["causes"] if c["in_force"]]
+    assert (cause["cause"], cause["instrument"]) == ("wire_scale", "wire")
+    assert abs(cause["parameters"]["ppm"] - 3000.0) < 3.0 * cause["sigma"]["ppm"]
+    assert content["heldout_mm"]["after"] < 0.7 * content["heldout_mm"]["before"]

@@ -1,7 +1,5 @@
 """Inverse kinematics: FK(IK) = identity for every ready robot and for random arms, branches, limits, reasons."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,6 +24,7 @@ METHODS = {
     "irb120_like": "spherical wrist",
     "ur10": "parallel arm",
     "scara_600": "numeric",
+    "palletiser": "numeric",
     "kr150_class_on_track": "spherical wrist on a track",
 }
 MODELS = {name: read_robot(CONFIGS / f"{name}.yaml") for name in ROBOTS}

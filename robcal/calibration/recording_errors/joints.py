@@ -93,7 +93,7 @@ def _axes(recorded: Recorded) -> Iterator[Trial]:
     """A joint about another axis than the robot file says."""
     joint = 0
     for at, frame in enumerate(recorded.model.frames):
-        if frame.axis is None:
+        if not frame.is_joint:
             continue
         joint += 1
         for axis, sign in product("xyz", (1, -1)):

@@ -71,7 +71,7 @@ def _zeros(recorded: Recorded) -> _Deviation:
     zeros = _polished(moved, zeros, free)
     large = [k for k in free if abs(_wrapped(zeros[k])) > NOTEWORTHY_ANGLE]
     zeros = _polished(moved, np.where(np.isin(np.arange(len(zeros)), large), zeros, 0.0), large)
-    values = {f"{joints[k].name}.{joints[k].joint_kind}": joints[k].sign * _wrapped(zeros[k]) for k in large}
+    values = {joints[k].zero_name: joints[k].zero_sign * _wrapped(zeros[k]) for k in large}
     parts = [f"{name.split('.')[0]} by {np.degrees(value):.4g} deg" for name, value in values.items()]
     words = f"the zero of the joint angles is off the robot file's: {', '.join(parts)}"
     return _Deviation("zero", values, missed(zeros), words)

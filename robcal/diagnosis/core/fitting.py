@@ -2,32 +2,33 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
 from robcal.diagnosis.core.recording import Recording, observation_data
 from robcal.diagnosis.scan.statistics import orthonormal_basis
+from robcal.estimation.levenberg import Linearised, Schedule, levenberg
+from robcal.estimation.minimum_norm import pseudo_covariance, solve
+from robcal.estimation.summary import TerminationSettings
 from robcal.physics.cause import Array, Constants, LinearCause, ObservationCause, prior_scales
 from robcal.robot.kernel import Kernel, PoseInputs
 from robcal.robot.kernel_cache import kernel_of
 from robcal.robot.model import RobotModel, Term
 from robcal.robot.terms import identifier
 
-UNDETERMINED = 1e-6
-"""Directions of the scaled Jacobian below this share of the largest stay as they are: their sigma would be a radian."""
 MOST_FREE = 12
 """A law with more amplitudes than these is a Gaussian process: its prior goes into the fit."""
 TERM_PARTS = 24
 """Amplitudes in one expression of the kernel, which may not grow without end."""
 TERM_LENGTH = 2400
 """Characters of the same."""
-RELEASE = 4.0
-"""Factor by which steps may grow after one that lowered the sum of squares."""
+DAMPING = Schedule(start=1.0, grow=256.0, shrink=1.0 / 16.0, undamped=np.inf)
+"""In units of the largest steps that make sense: near-parallel axes leave directions that a full step would follow
+beyond all linearity. As long as steps lower the sum of squares it fades, and the last ones are undamped."""
+NEGLIGIBLE = 5e-7
+"""Half the sum of squares that a further step need not save."""
 LARGEST_STEP = 5.0
 """Largest step of a parameter that makes sense, in its usual sizes."""
-MANY = 120
-"""Parameters from which normal equations replace the singular values of the Jacobian."""
 
 
 @dataclass(frozen=True)
@@ -161,88 +162,113 @@ def fit(
     names += [full for term in model.terms for full in term.parameter_names if full not in names]
     position = {name: i for i, name in enumerate(kernel.names)}
     columns = np.array([position[name] for name in names])
-    theta = np.array(kernel.theta0, dtype=float)
     direct = [item for item in accepted if isinstance(item.cause, ObservationCause)]
-    obs = recording.observations
-    linearised = partial(_linearised, kernel, recording, inputs, columns, direct)
-
-    width = len(names) + sum(len(item.names) for item in direct)
-    bounds = np.diag(damping(names, width, kernel.variables(theta, inputs)))[: len(names)]
     sizes = {f"{term.name}.{short}": size for term in model.terms for short, size in term.priors.items()}
-    held = np.array([k for k, name in enumerate(names) if name in sizes], dtype=np.intp)
-    prior = np.zeros((len(held), width))
-    scale, trust = 0.0, 1.0
-    best: tuple[float, Array, Array, Array] | None = None
-    for _ in range(iterations):
-        _, residual, jacobian = linearised(theta)
-        cost = _least(residual, jacobian[:, len(columns) :])
-        if best is None or cost <= best[0]:
-            # as long as steps keep their promise the damping fades, and the last ones are undamped
-            trust = trust if best is None else trust * RELEASE
-            best = (cost, theta.copy(), residual, jacobian)
-        else:
-            trust /= RELEASE**2
-            theta, residual, jacobian = best[1].copy(), best[2], best[3]
-        if len(held):
-            # a prior weighs against observations of the variance that they show
-            scale = scale or float(np.sqrt(residual @ residual / len(residual)))
-            prior[np.arange(len(held)), held] = [scale / sizes[names[k]] for k in held]
-        # steps are damped by the size that deviations can have: near-parallel axes leave directions that a full
-        # step would follow beyond all linearity
-        rows = np.concatenate([residual, np.zeros(len(bounds)), -prior[:, held] @ theta[columns[held]]])
-        step = solve(np.vstack([jacobian, bounds / trust, prior]), rows)[: len(columns)]
-        if len(held):
-            left = residual - jacobian[:, : len(columns)] @ step
-            scale = float(np.sqrt(left @ left / max(len(left) - width, 1)))
-        theta[columns] += step
-        if float(np.sum((jacobian[:, : len(columns)] @ step) ** 2)) < 1e-6:
-            break
-    frames, residual, jacobian = linearised(theta)
+    width = len(names) + sum(len(item.names) for item in direct)
+    start = np.array(kernel.theta0, dtype=float)
+    bounds = np.diag(damping(names, width, kernel.variables(start, inputs)))[: len(names)]
+    expected = np.array([sizes.get(name, np.inf) for name in names])
+    problem = _Problem(kernel, recording, inputs, columns, direct, bounds, expected)
+    at = problem.at(start)
+    if iterations:
+        at, _ = levenberg(problem.linearise, at, TerminationSettings(iterations, 6, 0.0, NEGLIGIBLE), DAMPING)
     # displacements of observations are linear: their amplitudes follow from the last linear problem
-    linear = solve(jacobian, residual)[len(columns) :] if direct else np.zeros(0)
-    residual = residual - jacobian[:, len(columns) :] @ linear
-    covariance = pseudo_covariance(np.vstack([jacobian, prior]))
-    filled = model.with_parameters({name: float(theta[position[name]]) for name in names})
-    done = _amplitudes(accepted, direct, names, position, theta, linear, covariance, len(columns))
+    linear = solve(at.jacobian, at.residual)[len(columns) :] if direct else np.zeros(0)
+    residual = at.residual - at.jacobian[:, len(columns) :] @ linear
+    prior = problem.prior(at.scale)
+    covariance = pseudo_covariance(np.vstack([at.jacobian, prior]))
+    filled = model.with_parameters({name: float(at.theta[position[name]]) for name in names})
     return Fit(
         filled,
         kernel,
-        theta,
+        at.theta,
         tuple(names),
-        done,
+        _amplitudes(accepted, direct, names, position, at.theta, linear, covariance, len(columns)),
         residual,
-        jacobian,
-        np.repeat(obs.pose, len(residual) // len(obs.pose)),
+        at.jacobian,
+        np.repeat(recording.observations.pose, len(residual) // len(recording.observations.pose)),
         inputs,
-        frames,
+        at.frames,
         covariance,
         prior,
-        -prior[:, : len(columns)] @ theta[columns],
+        -prior[:, : len(columns)] @ at.theta[columns],
         recording.common_errors(residual),
     )
 
 
-def _linearised(
-    kernel: Kernel, recording: Recording, inputs: PoseInputs, columns: Array, direct: Sequence[Accepted], theta: Array
-) -> tuple[Array, Array, Array]:
-    """Frames, whitened residuals (m,) and Jacobian (m, p) by the parameters ``columns``, then by observation causes."""
-    frames, J = kernel.frames_and_jacobian(theta, inputs, columns=columns)
-    residual, jacobian = recording.linearise(frames, J)
-    if direct:
-        data = observation_data(recording, frames, kernel.variables(theta, inputs))
-        shifts = [
-            item.cause.observation_shift(data, item.constants)
-            for item in direct
-            if isinstance(item.cause, ObservationCause)
-        ]
-        jacobian = np.concatenate([jacobian, *(recording.whiten(shift, frames) for shift in shifts)], axis=1)
-    return frames, residual, jacobian
+@dataclass(frozen=True)
+class _At:
+    """Parameters (P,), the frames, whitened residuals (m,) and Jacobian (m, p) there, and the rows' own scatter."""
+
+    theta: Array
+    frames: Array
+    residual: Array
+    jacobian: Array
+    scale: float
 
 
-def _least(residual: Array, columns: Array) -> float:
-    """Sum of squares (of whitened rows) that is left beside displacements of observations."""
-    left = residual - columns @ solve(columns, residual) if columns.shape[1] else residual
-    return float(left @ left)
+@dataclass(frozen=True)
+class _Problem:
+    """Least squares of the parameters ``columns`` (k,) of a kernel and the amplitudes of observation causes.
+
+    bounds : (k, p) rows that damp a step. expected : (k,) standard deviations about zero, infinite without: a prior
+        weighs against observations of the variance that they show.
+    """
+
+    kernel: Kernel
+    recording: Recording
+    inputs: PoseInputs
+    columns: Array
+    direct: Sequence[Accepted]
+    bounds: Array
+    expected: Array
+
+    def at(self, theta: Array, scale: float | None = None) -> _At:
+        """Linearised, the Jacobian's columns by ``columns``, then by observation causes."""
+        frames, J = self.kernel.frames_and_jacobian(theta, self.inputs, columns=self.columns)
+        residual, jacobian = self.recording.linearise(frames, J)
+        if self.direct:
+            data = observation_data(self.recording, frames, self.kernel.variables(theta, self.inputs))
+            shifts = [
+                item.cause.observation_shift(data, item.constants)
+                for item in self.direct
+                if isinstance(item.cause, ObservationCause)
+            ]
+            rows = (self.recording.whiten(shift, frames) for shift in shifts)
+            jacobian = np.concatenate([jacobian, *rows], axis=1)
+        scatter = float(np.sqrt(residual @ residual / len(residual))) if scale is None else scale
+        return _At(theta, frames, residual, jacobian, scatter)
+
+    def prior(self, scale: float) -> Array:
+        """(n, p) rows of what is expected of parameters, where rows of observations scatter by ``scale``."""
+        rows = scale * np.eye(len(self.columns), self.bounds.shape[1]) / self.expected[:, None]
+        return rows[np.isfinite(self.expected)]
+
+    def linearise(self, here: _At) -> Linearised[_At]:
+        """For the iteration; the scatter of the rows is held while one step is sought."""
+        k, prior = len(self.columns), self.prior(here.scale)
+
+        def cost(theta: Array, left: Array) -> float:
+            expected = prior[:, :k] @ theta[self.columns]
+            return 0.5 * float(left @ left + expected @ expected)
+
+        def evaluate(at: _At) -> float:
+            linear = at.jacobian[:, k:]
+            return cost(at.theta, at.residual - linear @ solve(linear, at.residual) if self.direct else at.residual)
+
+        now = evaluate(here)
+
+        def propose(damping: float) -> tuple[_At, float]:
+            rows = [here.jacobian, np.sqrt(damping) * self.bounds, prior]
+            expected = -prior[:, :k] @ here.theta[self.columns]
+            step = solve(np.vstack(rows), np.concatenate([here.residual, np.zeros(k), expected]))
+            theta = here.theta.copy()
+            theta[self.columns] += step[:k]
+            left = here.residual - here.jacobian @ step
+            scale = float(np.sqrt(left @ left / max(len(left) - len(step), 1)))
+            return self.at(theta, scale), now - cost(theta, left)
+
+        return Linearised(now, propose, evaluate)
 
 
 def damping(names: Sequence[str], columns: int, variables: Mapping[str, Array]) -> Array:
@@ -276,30 +302,3 @@ def _amplitudes(
             values = np.array([theta[position[name]] for name in full])
         done.append(replace(item, values=values, covariance=covariance[np.ix_(where, where)]))
     return tuple(done)
-
-
-def solve(jacobian: Array, residual: Array) -> Array:
-    """Minimum-norm least-squares step, columns scaled to unit length first."""
-    size = np.linalg.norm(jacobian, axis=0)
-    safe = np.where(size > 0, size, 1.0)
-    scaled = jacobian / safe
-    if jacobian.shape[1] > MANY:
-        gram = scaled.T @ scaled + UNDETERMINED**2 * np.eye(jacobian.shape[1])
-        return np.asarray(np.linalg.solve(gram, scaled.T @ residual) / safe)
-    return np.asarray(np.linalg.lstsq(scaled, residual, rcond=UNDETERMINED)[0] / safe)
-
-
-def pseudo_covariance(jacobian: Array) -> Array:
-    """Pseudo-inverse of the normal matrix, columns scaled; directions without information get no variance.
-
-    By singular values of the Jacobian, since those of the normal matrix drown in rounding at the square of its range.
-    """
-    size = np.linalg.norm(jacobian, axis=0)
-    safe = np.where(size > 0, size, 1.0)
-    scaled = jacobian / safe
-    if jacobian.shape[1] > MANY:  # the triangular factor has the same singular values
-        scaled = np.asarray(np.linalg.qr(scaled, mode="r"))
-    _, singular, right = np.linalg.svd(scaled, full_matrices=False)
-    seen = singular > UNDETERMINED * singular.max(initial=0.0)
-    root = (right[seen].T / singular[seen]) / safe[:, None]
-    return root @ root.T

@@ -12,9 +12,10 @@ from functools import cached_property
 import numpy as np
 
 from robcal.calibration.identifiability import repetitions
-from robcal.diagnosis.core.fitting import Fit, solve
+from robcal.diagnosis.core.fitting import Fit
 from robcal.diagnosis.core.recording import Recording
 from robcal.diagnosis.gain.heldout import block_labels
+from robcal.estimation.minimum_norm import solve
 from robcal.physics.cause import Array, ObservationCause
 from robcal.robot.kernel import PoseInputs
 from robcal.robot.model import GEOMETRIC_KINDS

@@ -9,8 +9,9 @@ import numpy as np
 
 from robcal.calibration.identifiability import repetitions
 from robcal.calibration.observations import DistanceObservations, FrameObservations, PointObservations
-from robcal.diagnosis.core.fitting import Accepted, Fit, damping, solve
+from robcal.diagnosis.core.fitting import Accepted, Fit, damping
 from robcal.diagnosis.core.recording import Recording, observation_data
+from robcal.estimation.minimum_norm import solve
 from robcal.physics.cause import Array, ObservationCause
 from robcal.transforms import invert, transform
 

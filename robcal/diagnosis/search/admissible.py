@@ -9,10 +9,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from robcal.diagnosis.core.fitting import Accepted, Fit, solve
+from robcal.diagnosis.core.fitting import Accepted, Fit
 from robcal.diagnosis.core.recording import Recording
 from robcal.diagnosis.gain.heldout import folds
 from robcal.diagnosis.scan.tangents import Tangents
+from robcal.estimation.minimum_norm import solve
 from robcal.physics.cause import Array
 
 CONFOUNDED = 0.8

@@ -7,7 +7,6 @@ import numpy as np
 from robcal.diagnosis.core.recording import Recording
 from robcal.robot.kernel_cache import kernel_of
 from robcal.robot.model import RobotModel
-from robcal.robot.terms import identifier
 
 NO_LOAD = 0.02
 """A joint whose largest moment is below this share of the robot's largest counts as unloaded."""
@@ -20,14 +19,14 @@ def unloaded_elasticities(model: RobotModel, recording: Recording, tied: Iterabl
     on it; but a base off the plumb line acts through it, which a search from the value zero could not see.
     """
     joints = [joint for joint in model.joints if not joint.prismatic]
-    own = {f"{joint.name}.elastic_{joint.joint_kind}": joint for joint in joints}
+    own = {joint.elastic_name: joint for joint in joints}
     known = {k: model.parameters.get(name, 0.0) for k, name in enumerate(own)}
     candidates = {k: name for k, name in enumerate(own) if name in set(tied) and not known[k]}
     if not candidates or not any(known.values()):
         return {}
     kernel = kernel_of(model, "converged")
     variables = kernel.variables(kernel.theta0, recording.inputs(kernel))
-    moments = [variables[f"{identifier(joint.name)}_m{joint.joint_kind}"] for joint in own.values()]
+    moments = [variables[f"torque{k}"] for k, joint in enumerate(model.joints, 1) if not joint.prismatic]
     largest = np.array([float(np.max(np.abs(moment))) for moment in moments])
     values: dict[str, float] = {}
     for k, name in candidates.items():

@@ -6,9 +6,9 @@ of gravity. The inverse is the nominal robot's, in closed form where its joint l
 (:mod:`robcal.robot.structure`), Levenberg-Marquardt otherwise. Nothing is allocated; only ``math.h`` and ``string.h``
 are included.
 
-The algorithms are the C files in ``c/``, which include each other as usual; which arm, which inverse is chosen by the
-macros ARM, CLOSED_FORM and INVERSE. Exported is one file: the robot's numbers (``robot_data.h.j2``), then the C files
-that this robot needs in the order of their includes.
+The algorithms are the C files in ``c/``, which include each other as usual; which loops, arm and inverse is chosen by
+the macros LINE_ANGLES, ARM, CLOSED_FORM and INVERSE. Exported is one file: the robot's numbers (``robot_data.h.j2``),
+then the C files that this robot needs in the order of their includes.
 """
 
 import re
@@ -33,12 +33,13 @@ from robcal.robot.kernel import Kernel
 from robcal.robot.kernel_graph import pose_graph
 from robcal.robot.model import Payload, RobotModel
 from robcal.robot.structure import SphericalWrist, find_structure
-from robcal.transforms import invert
+from robcal.transforms import Array, invert
 
 SOURCES = files("robcal.robot.export") / "c"
 _LOAD = "load"
 _STARTS = 24
 _UNLIMITED = 1e30
+_LINES = {False: "line_joints.h", True: "line_loops.h"}
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ class CSource:
     header_name, header, source_name, source : names and texts of the two files.
     covariates : in the order in which the functions expect them.
     data : the part of the source that is this robot's own (``robot_data.h``).
-    choices : the files that the macros ARM, CLOSED_FORM and INVERSE of the C sources stand for.
+    choices : the files that the macros LINE_ANGLES, ARM, CLOSED_FORM and INVERSE of the C sources stand for.
     """
 
     header_name: str
@@ -192,6 +193,12 @@ def _payloads(kernel: Kernel) -> list[dict[str, Any]]:
     return rows
 
 
+def _bars(chain: Chain) -> Array:
+    """Lengths, crank angle at zero and side of each four-bar, and a last row of zeros (C knows no empty arrays)."""
+    bars = [bar for _, bar in chain.coupling.bars] if chain.coupling is not None else []
+    return np.array([*([*bar.lengths, bar.crank_zero, bar.side] for bar in bars), [0.0] * 6])
+
+
 def _inverse(kernel: Kernel) -> tuple[dict[str, Any], dict[str, str]]:
     """What the templates need for chain and inverse, and the C files of this robot's inverse."""
     world_T_base, flange_T_tool = cell_frames(kernel)
@@ -216,7 +223,8 @@ def _inverse(kernel: Kernel) -> tuple[dict[str, Any], dict[str, str]]:
     structure = find_structure(arm) if arm is not None else None
     if arm is None or structure is None:
         starts = start_configurations(chain, _STARTS)
-        return {**values, "structure": None, "starts": starts}, {"INVERSE": "numeric_inverse.h"}
+        choices = {"LINE_ANGLES": _LINES[chain.coupling is not None], "INVERSE": "numeric_inverse.h"}
+        return {**values, "structure": None, "starts": starts, "bars": _bars(chain)}, choices
     wrist = structure if isinstance(structure, SphericalWrist) else None
     closed = {"CLOSED_FORM": "spherical_wrist.h", "ARM": f"arm_{wrist.arm}.h"} if wrist else None
     values |= {
@@ -226,4 +234,8 @@ def _inverse(kernel: Kernel) -> tuple[dict[str, Any], dict[str, str]]:
         "probe": perpendicular(arm.axes[5] if wrist else arm.axes[1]),
         "shoulder": wrist.shoulder if wrist else None,
     }
-    return values, {"INVERSE": "closed_inverse.h", **(closed or {"CLOSED_FORM": "parallel_arm.h"})}
+    return values, {
+        "LINE_ANGLES": _LINES[False],
+        "INVERSE": "closed_inverse.h",
+        **(closed or {"CLOSED_FORM": "parallel_arm.h"}),
+    }

@@ -7,6 +7,7 @@ and a calibration does not know (effort, velocity, moments of inertia) gets the 
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 from xml.etree import ElementTree
 
@@ -40,8 +41,16 @@ def urdf_text(model: RobotModel, template: str | None = None) -> str:
 
     Raises
     ------
-    InvalidInput : the template's joints are not the robot's.
+    InvalidInput : the template's joints are not the robot's; a robot with a four-bar, or with loops and a template.
     """
+    bars = [f.name for f in model.frames if f.fourbar is not None]
+    if bars:
+        raise InvalidInput(
+            f"URDF cannot express the four-bar of frame '{bars[0]}': its mimic joints are linear; export C, or the "
+            "numbers with --data"
+        )
+    if template is not None and model.has_loops:
+        raise InvalidInput("a URDF template cannot take loops of joints: export without a template")
     return _from_template(model, template) if template is not None else _plain(model)
 
 
@@ -51,7 +60,7 @@ def calibrated_frames(model: RobotModel) -> tuple[Frame, ...]:
     for f in model.frames:
         d = [model.parameters.get(f"{f.name}.{k}", 0.0) for k in ("x", "y", "z", "roll", "pitch", "yaw")]
         xyz, rpy = np.add(f.xyz, d[:3]), np.add(f.rpy, d[3:])
-        out.append(Frame(f.name, f.axis, f.prismatic, f.sign, f.limits, _triple(xyz), _triple(rpy), f.mass, f.cog))
+        out.append(replace(f, xyz=_triple(xyz), rpy=_triple(rpy)))
     return tuple(out)
 
 
@@ -79,7 +88,17 @@ def _plain(model: RobotModel) -> str:
         if f.mass > 0 or f.axis is not None:
             _add_inertial(element, f)
         kind = "fixed" if f.axis is None else "prismatic" if f.prismatic else "revolute" if f.limits else "continuous"
-        joint = _add_joint(root, f.name, kind, parent, link, f.xyz, f.rpy)
+        place: tuple[Any, Any] = (f.xyz, f.rpy)
+        for k, coefficient in f.follows[: None if f.is_joint else -1]:
+            between = f"{f.name}_with_{model.joints[k].name}"
+            _add_mimic(root, model, f, (k, coefficient), (between, parent, between + "_link", *place))
+            parent, place = between + "_link", ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+            ElementTree.SubElement(root, "link", name=parent)
+        if f.passive:
+            _add_mimic(root, model, f, f.follows[-1], (f.name, parent, link, *place))
+            parent = link
+            continue
+        joint = _add_joint(root, f.name, kind, parent, link, *place)
         if f.axis is not None:
             ElementTree.SubElement(joint, "axis", xyz=_text(joint_axis_in_child(f)))
             limits = {"effort": repr(EFFORT), "velocity": repr(VELOCITY)}
@@ -94,6 +113,25 @@ def _plain(model: RobotModel) -> str:
         _add_joint(root, "tool", "fixed", parent, "tool_link", tool[:3, 3], rpy_from_rotation(tool[:3, :3]))
     ElementTree.indent(root)
     return '<?xml version="1.0"?>\n' + ElementTree.tostring(root, encoding="unicode") + "\n"
+
+
+def _add_mimic(
+    root: ElementTree.Element,
+    model: RobotModel,
+    f: Frame,
+    turn: tuple[int, float],
+    place: tuple[str, str, str, Any, Any],
+) -> None:
+    """A joint (name, parent, child, xyz, rpy) that turns frame f by so much of another's true angle, zero included."""
+    k, coefficient = turn
+    name, parent, child, xyz, rpy = place
+    joint = _add_joint(root, name, "continuous", parent, child, xyz, rpy)
+    ElementTree.SubElement(joint, "axis", xyz=_text(joint_axis_in_child(replace(f, sign=1))))
+    ElementTree.SubElement(joint, "limit", effort=repr(EFFORT), velocity=repr(VELOCITY))
+    driver = model.joints[k]
+    offset = coefficient * driver.zero_sign * model.parameters.get(driver.zero_name, 0.0)
+    attributes = {"joint": driver.name, "multiplier": repr(coefficient), "offset": repr(offset)}
+    ElementTree.SubElement(joint, "mimic", attributes)
 
 
 def _add_joint(

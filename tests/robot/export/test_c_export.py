@@ -1,7 +1,5 @@
 """Exported C: compiled with all warnings as errors and compared with the kernel and the compensation in Python."""
 
-from __future__ import annotations
-
 import ctypes
 import shutil
 import subprocess
@@ -182,10 +180,10 @@ def test_numbers_that_are_not_finite_are_refused():
         function_body(ca.Function("f", [x], [x * float("inf")]), ("x",), ("y",))
 
 
-@pytest.mark.parametrize("kind", [*ARMS, "scara"])
+@pytest.mark.parametrize("kind", [*ARMS, "scara_600", "palletiser"])
 def test_c_sources_compile_and_pass_the_linter_as_they_lie_in_the_package(kind, tmp_path):
     """The files in ``c/`` through their own includes, without the export's amalgamation."""
-    robot = real_robot("scara_600", np.random.default_rng(1)) if kind == "scara" else _arm(kind)
+    robot = _arm(kind) if kind in ARMS else real_robot(kind, np.random.default_rng(1))
     code = export_c(robot, "bot")
     (tmp_path / "bot.h").write_text(code.header)
     (tmp_path / "robot_data.h").write_text(code.data)
@@ -204,7 +202,8 @@ def test_c_sources_compile_and_pass_the_linter_as_they_lie_in_the_package(kind, 
 
 
 def test_every_c_source_is_reached_by_some_robot():
-    robots = [_arm(kind) for kind in ARMS] + [real_robot("scara_600", np.random.default_rng(1))]
+    robots = [_arm(kind) for kind in ARMS]
+    robots += [real_robot(name, np.random.default_rng(1)) for name in ("scara_600", "palletiser")]
     exported = "".join(export_c(robot, "bot").source for robot in robots)
     for path in SOURCES.iterdir():
         if path.name.endswith((".c", ".h")):

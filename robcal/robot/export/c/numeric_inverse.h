@@ -9,7 +9,7 @@ int ROBOT(nominal_inverse)(const double base_T_tool[12], const double near[N], d
     memcpy(start, near, sizeof start);
     for (k = -1; k < STARTS; ++k) {
         memcpy(trial, k < 0 ? start : START[k], sizeof trial);
-        if (refine(base_T_tool, trial, 80)) {
+        if (refine(base_T_tool, trial, 80) && LOOPS_CLOSE(trial)) {
             int inside = turn_near(trial, start);
             if (inside || result == ROBOT(OUT_OF_REACH)) {
                 memcpy(q, trial, sizeof trial);
