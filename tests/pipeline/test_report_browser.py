@@ -48,10 +48,7 @@ def test_the_report_of_a_diagnosed_robot(diagnosed: Run) -> None:  # noqa: F811
     assert state["drawn"] == state["plots"]
     assert state["shown"] == int(state["plots"])
     assert state["title"].startswith(HOSTILE)
-<<<<<<< HEAD
-=======
     assert state["scroll"] <= 0
->>>>>>> main
 
 
 def test_the_report_of_images(image_run: Path, tmp_path: Path) -> None:
