@@ -26,7 +26,14 @@ from robcal.files.images import list_images
 from robcal.files.joint_logs import is_joint_log, log_of_robot, read_controller_log
 from robcal.files.laser_sensor import read_sensor, sensed_points
 from robcal.files.line_cameras import measured_lights, read_line_cameras
-from robcal.files.measurement_tables import MeasuredTable, check_marks, marks_of, measurements_of, without_frozen
+from robcal.files.measurement_tables import (
+    MeasuredTable,
+    check_marks,
+    marks_of,
+    measurements_of,
+    unmeasured,
+    without_frozen,
+)
 from robcal.files.poses_table import Poses, check_rows, poses_of
 from robcal.files.reseau_file import list_tiled, read_reseau
 from robcal.files.robot_import import read_any_robot
@@ -35,7 +42,7 @@ from robcal.files.tables import FaultyRows, Table, read_table
 from robcal.files.yaml_io import read_yaml
 from robcal.photogrammetry.core.adjustable import adjustable
 from robcal.physics.gravity_sag import without_masses
-from robcal.robot.chain import chain_of, forward
+from robcal.robot.hexapod import nominal_frames
 from robcal.robot.model import RobotModel
 
 T = TypeVar("T")
@@ -165,7 +172,7 @@ class _Reader:
         if entry.poses is not None:
             poses = self._part(partial(self._poses, entry.poses, robot))
             self.notes.extend(poses.notes if poses is not None else ())
-        if robot is not None and entry.poses is not None and without_masses(robot):
+        if robot is not None and entry.poses is not None and not robot.is_hexapod and without_masses(robot):
             self.notes.append(
                 "the robot file states no masses (mass_kg, cog_mm): sag under the arm's own weight is identified where "
                 "the poses show it, but what another payload does to the arm cannot be predicted"
@@ -180,6 +187,10 @@ class _Reader:
             poses = poses_from_images(self.path, cameras)
         measurements = self._tables(entry.measurements, robot, poses, bodies)
         instruments = self._part(partial(self._instruments, measurements, robot, poses, bodies)) or {}
+        sources = [measurements, *(i.tables for i in instruments.values())]
+        if poses is not None and None not in sources:  # a station sees poses in images
+            tables = {id(t): t for some in sources for t in some or ()}
+            self.warnings.extend(unmeasured(list(tables.values()), self.pose_names))
         if poses is not None and not self.faults:
             poses, measurements, instruments = self._at_own_angles(poses, measurements, instruments)
         return Campaign(
@@ -205,7 +216,7 @@ class _Reader:
         sound = self.faults is None or known == self.pose_names
         places = None
         if robot is not None and poses is not None and sound and poses.q.shape[1]:
-            places = forward(chain_of(robot), poses.q)[:, :3, 3]
+            places = nominal_frames(robot, poses.q)[:, :3, 3]
 
         def read(use: TableUse, table: Table) -> MeasuredTable:
             found = self._measurements(use, table, known if sound else self.pose_names, robot)

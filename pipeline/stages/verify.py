@@ -80,6 +80,7 @@ def work(context: Context) -> Outcome:
     doubts = doubtful_coordinates(run)
     noise = noise_of(identification, calibrated, poses)
     facts = robot_facts(identification, calibrated, poses, found.delivered, diagnosis, doubts, wrong)
+    facts = replace(facts, elsewhere=found.elsewhere)
     wanted = campaign.entry.tolerance_mm
     if wanted is not None:
         facts = replace(facts, conformity=conformity(found.delivered.errors["0"], wanted / 1e3, noise.along))

@@ -10,7 +10,7 @@ from pydantic import Field
 
 from robcal.errors import InvalidInput
 from robcal.files.measurement_tables import MeasuredTable, SharedErrors, few, point_covariance, pose_index, target_ids
-from robcal.files.robot_file import PlacementEntry, placement_data
+from robcal.files.placement import PlacementEntry, placement_data
 from robcal.files.schemas import Entry, Number, Positive, Text, proposal, read_entry
 from robcal.files.storage import write_text
 from robcal.files.tables import Table, read_table
@@ -176,7 +176,7 @@ def measured_lights(table: Table, pose_names: Sequence[str], system: LineCameraS
     InvalidInput : as :func:`lights_of`; a pose that is not in the table of poses.
     """
     table.require(READING)
-    pose, notes = pose_index(table, pose_names)
+    pose, notes = pose_index(table, pose_names), list[str]()
     target = target_ids(table)
     lights, found = lights_of(table, system)
     good = np.asarray(np.isfinite(found.p_world).all(axis=1))
