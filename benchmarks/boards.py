@@ -11,8 +11,6 @@ blur and two grey levels unknown, and the true noise of the sensor; of a circle,
 circles are ``findCirclesGrid``'s. Ours of circles are corrected for eccentricity with the true pose; beside it without.
 """
 
-from __future__ import annotations
-
 import argparse
 import time
 from dataclasses import dataclass, field, replace

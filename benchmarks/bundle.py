@@ -9,8 +9,6 @@ covariance of points and stations (conditional, see robcal/photogrammetry/bundle
 adjustment (sparse Jacobian, analytic).
 """
 
-from __future__ import annotations
-
 import argparse
 import time
 

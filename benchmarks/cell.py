@@ -5,8 +5,6 @@ base coordinates) differs from the identified one as its covariance says, its jo
 that the command does not know. The tool found by touching a tip is then used to find an object and to measure points.
 """
 
-from __future__ import annotations
-
 import argparse
 import tempfile
 from collections import defaultdict

@@ -11,8 +11,6 @@ Run: ``python -m benchmarks.centroids [--scenes 3] [--no-speed]``. Tables:
 Goals: 1.5 times the bound, 0.02 px RMS in full scenes, bias below 0.01 px under 10 % shading, no wrong code, 0.5 s.
 """
 
-from __future__ import annotations
-
 import argparse
 import time
 from collections.abc import Iterator

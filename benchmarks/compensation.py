@@ -6,8 +6,6 @@ and a payload. Distances are those of the tool, 250 mm off the flange; "near a l
 Jacobian's condition is below 0.02 (a wrist or elbow nearly stretched), given apart: one step is not enough there.
 """
 
-from __future__ import annotations
-
 import argparse
 import shutil
 import subprocess

@@ -6,8 +6,6 @@ Truth: `fixtures.warming`, temperatures distributed over gears and castings, non
     python -m benchmarks.drift --only hours | months | alarms
 """
 
-from __future__ import annotations
-
 import argparse
 import time
 from collections import Counter

@@ -4,8 +4,6 @@
 standard deviations (between robots) off in one parameter, or 0.6 times as many in four.
 """
 
-from __future__ import annotations
-
 import argparse
 
 import numpy as np

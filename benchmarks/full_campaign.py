@@ -6,8 +6,6 @@ memory of all its processes together (proportional set size, Linux), the verific
 where ``pipeline predict`` is wrong at poses nobody has measured. Goals: 100 s, 2 GB, 20 times better than nominal.
 """
 
-from __future__ import annotations
-
 import argparse
 import csv
 import json

@@ -6,8 +6,6 @@ Setting: a 125 kg class arm with six errors a frame, 80 poses in 6D with 0.05 mm
 unknown, base tilted by 22 mrad, 500 noise-free kept-out poses. The oracle knows which parameters are not zero.
 """
 
-from __future__ import annotations
-
 import argparse
 import time
 from dataclasses import replace

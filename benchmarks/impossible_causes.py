@@ -1,7 +1,5 @@
 """Causes that cannot be: signs, sizes, and effects of an instrument that it does not have."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

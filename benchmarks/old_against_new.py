@@ -6,8 +6,6 @@ Each tree runs its own benchmarks (quick variants) from its own folder, old and 
 slows down meanwhile slows both. Of every printed time the shortest over the rounds counts; the ratio is new to old.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import re

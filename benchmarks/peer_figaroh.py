@@ -5,8 +5,6 @@ Levenberg-Marquardt); only the weights of lengths and angles are told, as its co
 elasticities take the torque that pinocchio computes; the payload is made part of the last link.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import logging

@@ -5,8 +5,6 @@ uses, so that it need not guess. FIGAROH: see :mod:`benchmarks.peer_figaroh`. py
 above, so beside FIGAROH an older pybotics is installed; the version used is printed. Times are processor time.
 """
 
-from __future__ import annotations
-
 import importlib.metadata
 import importlib.util
 import time

@@ -7,8 +7,6 @@ them in turn, resected from half of their marks with the camera of the others, t
 is the same for all, so that only the marks differ.
 """
 
-from __future__ import annotations
-
 import argparse
 import time
 from pathlib import Path

@@ -8,8 +8,6 @@ the medians over the poses that are not kept out.
 Usage: ``python -m benchmarks.real_recordings CAMPAIGN ... [--keep FOLDER]``. Folders that are not there are skipped.
 """
 
-from __future__ import annotations
-
 import argparse
 import csv
 import json

@@ -8,8 +8,6 @@ Usage: ``python -m benchmarks.real_ur10 FOLDER`` where FOLDER holds ``robot.yaml
 ``poses.csv`` and ``frames.csv`` (Landgraf et al., IEEE CASE 2021; MIT licence).
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Sequence
 from pathlib import Path

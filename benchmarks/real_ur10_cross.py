@@ -8,8 +8,6 @@ other poses. A second table tells the turns, and what is left.
 Usage: ``python -m benchmarks.real_ur10_cross FOLDER [--picture FILE]``; FOLDER as for :mod:`benchmarks.real_ur10`.
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,7 +22,7 @@ from robcal.calibration.identification import identify
 from robcal.calibration.observations import FrameObservations
 from robcal.calibration.verification import fit_nominal
 from robcal.diagnosis.core.fitting import Accepted
-from robcal.diagnosis.search.curves import likenesses
+from robcal.diagnosis.search.likeness import likenesses
 from robcal.physics.angle_error_curve import CURVE_PRIOR, periodic_curve
 from robcal.physics.site import Joint
 from robcal.robot.kernel import Kernel

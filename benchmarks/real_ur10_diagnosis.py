@@ -7,8 +7,6 @@ diagnosis estimates for what it leaves unexplained.
 Usage: ``python -m benchmarks.real_ur10_diagnosis FOLDER [--series abcd]``; FOLDER as for :mod:`benchmarks.real_ur10`.
 """
 
-from __future__ import annotations
-
 import argparse
 import time
 from pathlib import Path

@@ -6,8 +6,6 @@ the pose cancels. Weakness: body temperatures were not recorded, air changed by 
     python -m benchmarks.real_ur10_drift FOLDER    # the folder of series A: poses.csv, frames.csv, ../robot.yaml
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -9,8 +9,6 @@ robot and measured without noise. Scores and goals are explained below their tab
 and not run again; ``--keep`` keeps campaigns, runs and predictions, one folder a seed.
 """
 
-from __future__ import annotations
-
 import argparse
 import csv
 import json

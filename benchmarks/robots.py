@@ -1,7 +1,5 @@
 """Simulated robots for the benchmarks: a 125 kg class arm with frame errors and compliances."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -8,8 +8,6 @@ one after the other, each from its own tree. Numbers are compared relative to th
 all; sentences are counted apart, because words may change where numbers must not.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

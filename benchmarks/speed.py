@@ -8,8 +8,6 @@ the rounds counts. Centres are compared in standard deviations of the old versio
 turn; of every stage the shortest time counts. The first run of compiled loops on a machine is timed apart.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

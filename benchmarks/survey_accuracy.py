@@ -9,8 +9,6 @@ lamps, screws and glints lying about. Goals: RMS after alignment below 5 um, sca
 Rendered images are kept in ``--cache`` (about 2.5 GB per hundred images of full size).
 """
 
-from __future__ import annotations
-
 import argparse
 import csv
 import json

@@ -5,8 +5,6 @@ noise of 0.05 px) by a lens with radial and tangential distortion and pixels tha
 The survey is adjusted first, then the diagnosis runs alone. Goal: 30 s on one core for 100 images.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

@@ -7,8 +7,6 @@ The true robot has six errors a frame, compliances about and across its joint ax
 The floor is what the true robot itself would show against the same measurements.
 """
 
-from __future__ import annotations
-
 import argparse
 
 import numpy as np

@@ -1,7 +1,5 @@
 """From arrays of your own to C for a controller: a robot as a Denavit-Hartenberg table, joint angles, tool frames."""
 
-from __future__ import annotations
-
 import numpy as np
 
 import robcal

@@ -1,7 +1,5 @@
 """Which physics does the model lack? A robot with backlash in one axis, and what its recording says of it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory

@@ -1,7 +1,5 @@
 """Coordinates of a plate's targets from photographs: detection, bundle adjustment with self-calibration, scale."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory

@@ -3,8 +3,6 @@
 The tables are simulated here; with your own, only the lines from ``read_any_robot`` on are needed.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory

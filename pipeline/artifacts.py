@@ -24,6 +24,7 @@ if TYPE_CHECKING:  # a stage depends on the types that it uses, not on those of 
     from robcal.photogrammetry.survey.types import SurveyResult
     from robcal.recipe.evidence import Evidence
     from robcal.recipe.identification import Identification
+    from robcal.recipe.joint import JointlyAdjusted
     from robcal.recipe.verification import RobotVerification
     from robcal.transforms import Array
 
@@ -61,6 +62,8 @@ PLACED: Artifact[RobotRecording] = Artifact("placed", "diagnose")
 """The recording in the frame of its first pose, where the station or the base moved or a zero jumped."""
 DELIVERED: Artifact[RobotVerification] = Artifact("delivered", "diagnose")
 """The verification of the robot in force."""
+ADJUSTED: Artifact[JointlyAdjusted] = Artifact("adjusted", "adjust")
+"""The robot in force from one adjustment of marks, cameras, body and robot."""
 HAND_EYE: Artifact[HandEyeRun] = Artifact("hand_eye", "hand_eye")
 RELATIVE_COVARIANCE: Artifact[Array] = Artifact("relative", "diagnose")
 """Covariance (p, p) of the robot's parameters where the errors of the station are known."""

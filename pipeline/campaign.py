@@ -11,6 +11,7 @@ from robcal.files.camera_file import CameraFile
 from robcal.files.measurement_tables import MarksTable, MeasuredTable
 from robcal.files.poses_table import Poses
 from robcal.files.yaml_io import YamlDocument
+from robcal.photogrammetry.tiles.transformation import Reseau
 from robcal.robot.model import RobotModel
 from robcal.transforms import Array
 
@@ -22,6 +23,7 @@ class ImageSource:
     Attributes
     ----------
     images : name -> file (the name is the file name; for a station camera the pose id); empty if marks are given.
+    reseau : the grid of a camera that takes tiles; ``images`` are then lists of tiles. reseau_files : it was read from.
     start : camera file with start values, None if there is none.
     """
 
@@ -30,6 +32,8 @@ class ImageSource:
     start: CameraFile | None
     start_path: Path | None = None
     size: tuple[int, int] | None = None
+    reseau: Reseau | None = field(default=None, repr=False)
+    reseau_files: tuple[Path, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:

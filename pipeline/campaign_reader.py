@@ -19,18 +19,28 @@ from robcal.errors import InvalidInput, RobcalError
 from robcal.files.body_file import check_ring_codes, read_body
 from robcal.files.camera_file import read_camera
 from robcal.files.camera_import import split_choice
+from robcal.files.commanded import at_own_angles, commanded_angles
 from robcal.files.flange_poses import read_flange_poses
 from robcal.files.foreign_tables import read_mapped_table
 from robcal.files.images import list_images
 from robcal.files.joint_logs import is_joint_log, log_of_robot, read_controller_log
+from robcal.files.laser_sensor import read_sensor, sensed_points
 from robcal.files.line_cameras import measured_lights, read_line_cameras
-from robcal.files.measurement_tables import MeasuredTable, check_marks, marks_of, measurements_of, without_frozen
+from robcal.files.measurement_tables import (
+    MeasuredTable,
+    check_marks,
+    marks_of,
+    measurements_of,
+    unmeasured,
+    without_frozen,
+)
 from robcal.files.poses_table import Poses, check_rows, poses_of
+from robcal.files.reseau_file import list_tiled, read_reseau
 from robcal.files.robot_import import read_any_robot
 from robcal.files.schemas import parse, parse_leniently, proposal
 from robcal.files.tables import FaultyRows, Table, read_table
 from robcal.files.yaml_io import read_yaml
-from robcal.photogrammetry.core.camera import Camera
+from robcal.photogrammetry.core.adjustable import adjustable
 from robcal.physics.gravity_sag import without_masses
 from robcal.robot.chain import chain_of, forward
 from robcal.robot.model import RobotModel
@@ -177,6 +187,12 @@ class _Reader:
             poses = poses_from_images(self.path, cameras)
         measurements = self._tables(entry.measurements, robot, poses, bodies)
         instruments = self._part(partial(self._instruments, measurements, robot, poses, bodies)) or {}
+        sources = [measurements, *(i.tables for i in instruments.values())]
+        if poses is not None and None not in sources:  # a station sees poses in images
+            tables = {id(t): t for some in sources for t in some or ()}
+            self.warnings.extend(unmeasured(list(tables.values()), self.pose_names))
+        if poses is not None and not self.faults:
+            poses, measurements, instruments = self._at_own_angles(poses, measurements, instruments)
         return Campaign(
             path=self.path,
             entry=entry,
@@ -203,7 +219,7 @@ class _Reader:
             places = forward(chain_of(robot), poses.q)[:, :3, 3]
 
         def read(use: TableUse, table: Table) -> MeasuredTable:
-            found = self._measurements(use, table, known if sound else self.pose_names)
+            found = self._measurements(use, table, known if sound else self.pose_names, robot)
             found = found if places is None else without_frozen(found, places, known)
             self._check_targets(table, found, bodies)
             return found
@@ -214,9 +230,16 @@ class _Reader:
             self.warnings.extend(table.notes)
         return tables
 
-    def _measurements(self, use: TableUse, table: Table, names: Sequence[str]) -> MeasuredTable:
+    def _measurements(
+        self, use: TableUse, table: Table, names: Sequence[str], robot: RobotModel | None
+    ) -> MeasuredTable:
+        if use.sensor is not None:
+            path = self._file(use.sensor)
+            return replace(
+                sensed_points(table, names, read_sensor(path), commanded_angles(table, robot)), sources=(path,)
+            )
         if use.line_cameras is None:
-            return measurements_of(table, names)
+            return measurements_of(table, names, q=commanded_angles(table, robot))
         path = self._file(use.line_cameras)
         return replace(measured_lights(table, names, read_line_cameras(path)), sources=(path,))
 
@@ -260,6 +283,29 @@ class _Reader:
             name: InstrumentSource(found, entry.instruments.get(name), worlds[name], tools[name])
             for name, found in tables.items()
         }
+
+    def _at_own_angles(
+        self, poses: Poses, measurements: tuple[MeasuredTable, ...], instruments: dict[str, InstrumentSource]
+    ) -> tuple[Poses, tuple[MeasuredTable, ...], dict[str, InstrumentSource]]:
+        """Every reading at the joint angles that its row states, where they are not those of its pose."""
+        known = {id(t): t for t in (*measurements, *(t for i in instruments.values() for t in i.tables or ()))}
+        log, made = at_own_angles(poses, list(known.values()))
+        if log is poses:
+            return poses, measurements, instruments
+        if self.entry.station is not None or self.entry.hand_eye is not None:
+            raise self._error(
+                ("poses",),
+                "tables of measurements state other joint angles than those of their poses, which have images as well: "
+                "give these readings poses of their own",
+            )
+        self.notes.append(f"readings at joint angles of their own: {len(log)} poses in place of {len(poses)}")
+        new = dict(zip(known, made, strict=True))
+
+        def at(tables: tuple[MeasuredTable, ...]) -> tuple[MeasuredTable, ...]:
+            return tuple(new[id(t)] for t in tables)
+
+        sources = {n: i if i.tables is None else replace(i, tables=at(i.tables)) for n, i in instruments.items()}
+        return log, at(measurements), sources
 
     def _check_priors(self, robot: RobotModel) -> None:
         try:
@@ -337,12 +383,13 @@ class _Reader:
             return BodySource(file)
         place = ("bodies", name, "survey")
         source = self._source(use.survey, use.survey.camera, place, f"the survey of '{name}'")
-        self._brown(source, place)
-        return BodySource(file, source, use.survey)
+        return BodySource(file, _adjustable(source), use.survey)
 
     def _source(
         self, entry: SurveyEntry | StationCameraEntry, camera: str | None, place: tuple[str | int, ...], what: str
     ) -> ImageSource:
+        if entry.tiles is not None and entry.images is None:
+            raise self._error((*place, "tiles"), f"'tiles' of {what} needs 'images': a folder of lists of tiles")
         if (entry.images is None) == (entry.observations is None):
             raise self._error(place, f"{what} needs either 'images' (a folder) or 'observations' (a CSV file)")
         start, start_path = None, None
@@ -357,7 +404,19 @@ class _Reader:
             check_marks(marks, size)
             return ImageSource({}, marks, start, start_path, size)
         folder = self._place(str(entry.images)).absolute()  # the report looks for them from anywhere
-        return ImageSource(list_images(folder, what), None, start, start_path, size)
+        if entry.tiles is None:
+            return ImageSource(list_images(folder, what), None, start, start_path, size)
+        reseau, files = read_reseau(self._place(entry.tiles))
+        self.files.extend(files)
+        whole = (reseau.shape[1], reseau.shape[0])
+        if size not in (None, whole):
+            where = start_path or self.path
+            raise InvalidInput(
+                f"{where}: {size[0] if size else 0} x {size[1] if size else 0} px, but the mosaic of "
+                f"{files[0].name} has {whole[0]} x {whole[1]}: calibrate the "
+                "mosaic itself, one pitch around the grid included"
+            )
+        return ImageSource(list_tiled(folder, what), None, start, start_path, whole, reseau, files)
 
     def _station(self, poses: Poses | None) -> dict[str, ImageSource]:
         station = self.entry.station
@@ -374,19 +433,10 @@ class _Reader:
 
     def _camera(self, name: str, use: StationCameraEntry, poses: Poses | None) -> ImageSource:
         source = self._source(use, use.calibration, ("station", "cameras", name), f"camera '{name}'")
-        self._brown(source, ("station", "cameras", name))
+        source = _adjustable(source)
         if use.images is not None:
             source = replace(source, images=images_by_stem(source.images))
         return self._match_poses(source, name, poses)
-
-    def _brown(self, source: ImageSource, place: tuple[str | int, ...]) -> None:
-        """Refuse a lens that a survey or a station cannot adjust."""
-        if source.start is not None and type(source.start.camera) is not Camera:
-            raise self._error(
-                place,
-                f"{source.start_path}: surveys and stations adjust Brown's lens (k1, k2, p1, p2, k3): leave the "
-                "calibration out, the camera is then self-calibrated (other lenses serve a hand-eye calibration)",
-            )
 
     def _match_poses(self, source: ImageSource, camera: str, poses: Poses | None) -> ImageSource:
         if poses is None:
@@ -410,3 +460,10 @@ class _Reader:
             return f"target {target} is in no body of the campaign{remedy}"
 
         table.refuse(strange, told)
+
+
+def _adjustable(source: ImageSource) -> ImageSource:
+    """The source with start values that surveys and stations adjust, whatever the lens."""
+    if source.start is None:
+        return source
+    return replace(source, start=replace(source.start, camera=adjustable(source.start.camera)))

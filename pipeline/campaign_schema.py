@@ -1,9 +1,9 @@
 """campaign.yaml (format robcal/campaign-1): the entries as a person writes them."""
 
 import re
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import BeforeValidator, Field
+from pydantic import BeforeValidator, Field, model_validator
 
 from robcal.files.foreign_tables import Orientation, TableMap
 from robcal.files.robot_file import PayloadEntry
@@ -64,9 +64,13 @@ class FixedDatum(Entry):
 
 
 class SurveyEntry(Entry):
-    """A free-hand image set of a body, or marks measured by another program."""
+    """A free-hand image set of a body, or marks measured by another program.
+
+    With ``tiles`` (a grid file) ``images`` holds lists of tiles.
+    """
 
     images: Text | None = None
+    tiles: Text | None = None
     observations: Text | None = None
     camera: Text | None = None
     size_px: tuple[Whole, Whole] | None = None
@@ -89,9 +93,10 @@ class BodyUse(Entry):
 
 
 class StationCameraEntry(Entry):
-    """A camera that watches the robot."""
+    """A camera that watches the robot; with ``tiles`` (a grid file) ``images`` holds lists of tiles."""
 
     images: Text | None = None
+    tiles: Text | None = None
     observations: Text | None = None
     calibration: Text | None = None
     size_px: tuple[Whole, Whole] | None = None
@@ -138,6 +143,7 @@ class ModelEntry(Entry):
     robust: bool = True
     statics: Literal["one_step", "converged"] = "converged"
     joint_sigma_deg: NotNegative | None = None
+    adjustment: Literal["staged", "joint"] = "staged"
     priors: dict[Text, Positive] = Field(default_factory=dict)
 
 
@@ -167,7 +173,7 @@ class RobotUse(Entry):
 
 
 class TableUse(Entry):
-    """A table, and how to read one of another program; ``line_cameras``: the system whose readings it holds."""
+    """A table, and how to read one of another program; ``line_cameras``, ``sensor``: whose raw readings it holds."""
 
     file: Text
     columns: dict[Text, Text] = Field(default_factory=dict)
@@ -177,10 +183,17 @@ class TableUse(Entry):
     header: bool = True
     orientation: Orientation = "rpy"
     line_cameras: Text | None = None
+    sensor: Text | None = None
+
+    @model_validator(mode="after")
+    def _one_kind_of_readings(self) -> Self:
+        if self.line_cameras is not None and self.sensor is not None:
+            raise ValueError("holds readings of 'line_cameras' or of a 'sensor': state one of them")
+        return self
 
     def table_map(self) -> TableMap | None:
         """How to read the table; None where it is one of the project's own."""
-        given = self.model_dump(exclude={"file", "line_cameras"}, exclude_defaults=True)
+        given = self.model_dump(exclude={"file", "line_cameras", "sensor"}, exclude_defaults=True)
         return TableMap(**given) if given else None
 
 

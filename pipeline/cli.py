@@ -23,6 +23,7 @@ from pipeline.command_line import (
 )
 from pipeline.drift_commands import app as drift_app
 from pipeline.fleet_commands import history, many
+from pipeline.laser_sensor_commands import sensor
 from pipeline.line_camera_commands import lines
 from pipeline.live_commands import live_app
 from pipeline.mastering_commands import mastering
@@ -42,6 +43,7 @@ app.add_typer(mastering)
 app.add_typer(programs)
 app.add_typer(many)
 app.add_typer(lines, name="lines")
+app.add_typer(sensor, name="sensor")
 app.add_typer(live_app)
 app.add_typer(history, name="history")
 

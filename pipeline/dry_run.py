@@ -19,6 +19,7 @@ _ROUGH: dict[str, Callable[[int, int, int], float]] = {
     "measure": lambda images, poses, workers: 1.0 + 0.02 * poses,
     "frames": lambda images, poses, workers: 1.0 + 0.02 * poses,
     "identify": lambda images, poses, workers: 2.0 + 0.1 * poses,
+    "adjust": lambda images, poses, workers: 1.0 + 0.03 * poses,
     "diagnose": lambda images, poses, workers: 20.0 + 1.5 * poses,
     "verify": lambda images, poses, workers: 2.0 + 0.2 * poses,
     "report": lambda images, poses, workers: 3.0,

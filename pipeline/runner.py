@@ -155,6 +155,9 @@ def _run_stages(context: Context, until: str | None, start: str | None, only: Se
     campaign, run = context.campaign, context.run
     stages = [stage for stage in STAGES if stage.applies(campaign)]
     names = [stage.name for stage in stages]
+    for name in STAGE_NAMES:
+        if name not in names:
+            run.forget(name)  # what an earlier campaign.yaml asked for does not hold any more
     ran: list[str] = []
     skipped: list[str] = []
     for stage in stages:

@@ -1,7 +1,5 @@
 """The errors raised on purpose."""
 
-from __future__ import annotations
-
 import pytest
 
 from robcal.errors import DegenerateGeometry, InvalidInput, NotIdentifiable, RobcalError

@@ -3,8 +3,6 @@
 ``docs/extending/instrument.md`` explains this file.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -45,7 +43,7 @@ class HeightObservations:
         """Variances (m, 1, 1)."""
         return (self.sigma**2)[:, None, None]
 
-    def subset(self, poses: ArrayLike) -> HeightObservations:
+    def subset(self, poses: ArrayLike) -> "HeightObservations":
         """The rows of the given poses, renumbered to their order."""
         chosen = np.atleast_1d(np.asarray(poses))
         chosen = np.flatnonzero(chosen) if chosen.dtype == bool else chosen

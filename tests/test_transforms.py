@@ -1,7 +1,5 @@
 """Laws of frames: group axioms, small perturbations, covariance transport; near identity and near half a turn."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

@@ -4,8 +4,6 @@ Packages stand in the layers that the import rules of pyproject.toml give them; 
 modules of another (those that follow from others are left out).
 """
 
-from __future__ import annotations
-
 import argparse
 import html
 import tomllib

@@ -6,8 +6,6 @@ FOLDER holds what `pipeline demo --out FOLDER` left; without it a campaign is re
 Needs Chromium for the pages of the report (`test` of pyproject.toml brings its driver).
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import shutil

@@ -7,8 +7,6 @@
 Records are appended to --out one by one; what it holds already is not run again.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

@@ -4,8 +4,6 @@
 ``command`` runs the commands ``pipeline run`` and ``pipeline predict`` as a user would.
 """
 
-from __future__ import annotations
-
 import csv
 import json
 import subprocess

@@ -5,8 +5,6 @@ whitened measurements. The share of the true effect's projected signature that t
 cosine with the truth; above 0.99 no recording of that size and noise tells the two apart at the SNRs in question.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any

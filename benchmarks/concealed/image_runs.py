@@ -1,7 +1,5 @@
 """Batteries of robots with their own station, from rendered images to the diagnosis."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import tempfile

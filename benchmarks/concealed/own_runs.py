@@ -1,7 +1,5 @@
 """Batteries of robots with their own station, at the level of marks, through the stages of ``pipeline run``."""
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Scores of a diagnosis of a robot with its own station: names, places, intervals, gain on poses that were kept out."""
 
-from __future__ import annotations
-
 import json
 import os
 import traceback

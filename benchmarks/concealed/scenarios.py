@@ -1,7 +1,5 @@
 """Batteries of scenarios: nulls, single causes, mixtures, effects outside the library, inseparable pairs, decoys."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial

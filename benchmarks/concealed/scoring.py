@@ -1,7 +1,5 @@
 """Scores of one answer against its truth, as flat records that can be stored and tabulated."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Batteries at the level of marks: surveys and stations without robot, run by the commands."""
 
-from __future__ import annotations
-
 import tempfile
 import traceback
 from collections.abc import Iterator

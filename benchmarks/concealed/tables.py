@@ -1,7 +1,5 @@
 """Tables for the documentation from stored records."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 

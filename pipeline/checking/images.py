@@ -12,6 +12,7 @@ from pipeline.campaign_schema import SurveyEntry
 from pipeline.checking.joints import Looked
 from pipeline.checking.surveys import named
 from pipeline.stages.detect import settings_for, sources
+from pipeline.tiled_images import tile_files
 from robcal.errors import InvalidInput, RobcalError
 from robcal.files.body_file import BodyFile
 from robcal.files.images import check_image_file, read_image
@@ -34,8 +35,8 @@ def look_into_images(campaign: Campaign) -> Looked:
         campaign = replace(campaign, entry=campaign.entry.model_copy(update={"station": None}))
     for source, (images, body, survey) in sources(campaign).items():
         faults += _headers(images)
-        if body.board is not None:
-            continue  # found by its own detector
+        if body.board is not None or images.reseau is not None:
+            continue  # found by its own detector, or tile by tile
         wrong, doubtful = _look(source, images, body, survey)
         faults += wrong
         doubts += doubtful
@@ -48,7 +49,8 @@ def _headers(images: ImageSource) -> list[str]:
     begin = time.monotonic()
     for path in images.images.values():
         try:
-            check_image_file(path)
+            for file in [path] if images.reseau is None else tile_files(path):
+                check_image_file(file)
         except InvalidInput as error:
             faults.append(str(error))
         if time.monotonic() - begin > SECONDS:

@@ -1,7 +1,5 @@
 """A page with the whole history of a drift control: one self-contained HTML file."""
 
-from __future__ import annotations
-
 import html
 import json
 from collections.abc import Sequence
@@ -102,6 +100,7 @@ def _html(place: Path | str, tours: Sequence[Any], alarms: Sequence[Any], figure
         calls.append(f"[{json.dumps(f'p{k}')}, {content}]")
     script = (
         f"const figures = [{', '.join(calls)}];"
+        "document.documentElement.dataset.plots = String(figures.length);"
         "Promise.all(figures.map(function (f) {"
         "return Plotly.newPlot(f[0], f[1][0], f[1][1], {displaylogo: false, responsive: true}); }))"
         ".then(function () { document.documentElement.dataset.drawn = String(figures.length); });"

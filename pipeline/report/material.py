@@ -132,7 +132,8 @@ class Material:
     @cached_property
     def calibrated(self) -> CalibratedRobot | None:
         """The calibrated robot with what the diagnosis added."""
-        found = self.find(artifacts.CALIBRATED)
+        adjusted = self.find(artifacts.ADJUSTED)
+        found = self.find(artifacts.CALIBRATED) if adjusted is None else adjusted.robot
         return found if found is not None or self.identification is None else self.identification.robot
 
     @cached_property

@@ -20,6 +20,9 @@ def parameter_chapter(material: Material) -> Chapter:
     """Identified parameters with sigmas, eliminated ones, correlations, condition."""
     blocks: list[Block] = []
     calibrated, identification = material.calibrated, material.identification
+    adjusted = material.result.get("adjustment")
+    if adjusted is not None:
+        blocks.append(Text(_adjustment(adjusted)))
     if calibrated is not None:
         blocks += [_parameters(calibrated), _placements(calibrated.model)]
         if calibrated.model.terms:
@@ -32,6 +35,16 @@ def parameter_chapter(material: Material) -> Chapter:
         "Deviations from the nominal robot, each with its standard deviation; those beyond three sigma are marked. "
         "What the data could not tell apart was eliminated, and is named with what it is tied to.",
         tuple(blocks),
+    )
+
+
+def _adjustment(section: dict[str, Any]) -> str:
+    """How marks, cameras, body and robot were adjusted together."""
+    scatter = number(max(section["joint_scatter_deg"]), 2)
+    return (
+        f"One adjustment of {section['marks']} marks: cameras, body, base, tool and robot together, in "
+        f"{section['poses']} poses whose joints scatter by {scatter} deg. The uncertainty of the parameters holds in "
+        "the world of the cameras."
     )
 
 

@@ -13,6 +13,7 @@ from pipeline.messages import track
 from pipeline.parallel import in_processes
 from pipeline.sources import code_version
 from pipeline.stages.base import Context, Outcome, Stage
+from pipeline.tiled_images import detect_tiled, tile_files
 from robcal.errors import RobcalError
 from robcal.files.body_file import BodyFile
 from robcal.files.images import read_image
@@ -21,6 +22,7 @@ from robcal.imaging.detections import Detections
 from robcal.imaging.settings import DetectionSettings
 from robcal.photogrammetry.boards.detect import find_board
 from robcal.photogrammetry.boards.layout import Board
+from robcal.photogrammetry.tiles.transformation import Reseau
 from robcal.recipe.detection import detection_settings
 
 NAME = "detect"
@@ -35,6 +37,7 @@ class _Job:
     key: str
     settings: DetectionSettings
     board: Board | None
+    reseau: Reseau | None = None
 
 
 def sources(campaign: Campaign) -> dict[str, tuple[ImageSource, BodyFile, SurveyEntry | None]]:
@@ -70,11 +73,12 @@ def _detect(job: _Job) -> ImageEntry:
             found = None  # damaged: detect again
     if found is None:
         try:
-            image = read_image(job.path)
-            if job.board is None:
-                found = detect_targets(image, job.settings)
+            if job.reseau is not None:
+                found = detect_tiled(job.path, job.reseau, job.settings, job.board)
+            elif job.board is None:
+                found = detect_targets(read_image(job.path), job.settings)
             else:
-                found = find_board(image, job.board, job.settings.polarity)
+                found = find_board(read_image(job.path), job.board, job.settings.polarity)
         except RobcalError as error:
             told = str(error) if str(job.path) in str(error) else f"{job.path}: {error}"
             return ImageEntry(job.source, job.name, job.path, None, (0, 0), 0, 0, 0, told)
@@ -93,14 +97,19 @@ def work(context: Context) -> Outcome:
     campaign, run = context.campaign, context.run
     jobs: list[_Job] = []
     hashes: dict[str, dict[str, str]] = {}
-    version = code_version("robcal.files.images", "robcal.photogrammetry.boards.detect")
+    version = code_version("pipeline.tiled_images", "robcal.photogrammetry.boards.detect")
     for source, (images, body, survey) in sources(campaign).items():
         settings = settings_for(body, survey)
         for name, path in images.images.items():
             content = run.hash(path)
+            if images.reseau is not None:
+                tiles = (*tile_files(path), *images.reseau_files)
+                content = fingerprint(content, [run.hash(file) for file in tiles])
             refuse_duplicate(hashes.setdefault(source, {}), content, path)
             key = fingerprint(content, codec.encode([settings, body.board], {}), version)[:32]
-            jobs.append(_Job(source, name, path, str(run.artifact(detections(key))), key, settings, body.board))
+            jobs.append(
+                _Job(source, name, path, str(run.artifact(detections(key))), key, settings, body.board, images.reseau)
+            )
     results = in_processes(_detect, jobs, context.workers)
     entries = list(track(results, len(jobs), "detecting targets"))
     refuse_unreadable(entries)
@@ -112,6 +121,7 @@ def work(context: Context) -> Outcome:
         for _, body, _ in sources(campaign).values()
         if body.board is not None and body.board.turns > 1
     ]
+    notes += [entry.message for entry in entries if entry.targets and entry.message]
     index = DetectionIndex(tuple(entries))
     path = run.save(DETECTED, index)
     result = {
@@ -123,12 +133,21 @@ def work(context: Context) -> Outcome:
     return Outcome({"detection": result}, [path], notes)
 
 
+def _tiles(images: ImageSource) -> list[Path]:
+    """Files beside the lists of tiles."""
+    if images.reseau is None:
+        return []
+    return [*images.reseau_files, *(file for path in images.images.values() for file in tile_files(path))]
+
+
 STAGE = Stage(
     name=NAME,
     applies=lambda campaign: bool(sources(campaign)),
     work=work,
     inputs=lambda campaign: [
-        path for images, body, _ in sources(campaign).values() for path in (*images.images.values(), body.path)
+        path
+        for images, body, _ in sources(campaign).values()
+        for path in (*images.images.values(), *_tiles(images), body.path)
     ],
     settings=lambda campaign: {
         source: [codec.encode([settings_for(body, survey), body.board], {}), list(images.images), images.size]

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.artifacts import CALIBRATED, DIAGNOSED_INSTRUMENTS, HAND_EYE, IDENTIFICATION, INSTRUMENTS
+from pipeline.artifacts import ADJUSTED, CALIBRATED, DIAGNOSED_INSTRUMENTS, HAND_EYE, IDENTIFICATION, INSTRUMENTS
 from pipeline.bodies import body_for_robot
 from pipeline.campaign import Campaign
 from pipeline.instrument_results import instrument_notes, instruments_result
@@ -193,7 +193,7 @@ def instruments_in_force(run: Run) -> IdentifiedInstruments | None:
 
 
 def load_calibrated(run: Run, instrument: str | None = None) -> CalibratedRobot:
-    """The robot with all that was found out about it: after the diagnosis where there was one.
+    """The robot with all that was found out about it: after diagnosis and joint adjustment where there were such.
 
     In the world and with the tool of an ``instrument``; of several, by default of the one that tells most.
 
@@ -201,7 +201,8 @@ def load_calibrated(run: Run, instrument: str | None = None) -> CalibratedRobot:
     ------
     InvalidInput : the run has no calibrated robot, or no such instrument.
     """
-    robot: CalibratedRobot | None = run.find(CALIBRATED)
+    adjusted = run.find(ADJUSTED)
+    robot: CalibratedRobot | None = run.find(CALIBRATED) if adjusted is None else adjusted.robot
     identified = run.find(IDENTIFICATION)
     if robot is None and identified is not None:
         robot = identified.robot

@@ -26,6 +26,6 @@ STAGE = Stage(
     work=work,
     inputs=no_files,
     settings=lambda campaign: campaign.name,
-    after=("detect", "survey", "orient", "measure", "frames", "identify", "diagnose", "verify", "hand_eye"),
+    after=("detect", "survey", "orient", "measure", "frames", "identify", "diagnose", "adjust", "verify", "hand_eye"),
     module=__name__,
 )

@@ -68,13 +68,7 @@ class Evaluator:
 
     def fold(self, theta: Array, state: State) -> State:
         """A state with moved parameters, deviations of base and tool folded into the references."""
-        W, F = state.world_T_base, state.flange_T_tool
-        if np.any(theta[self._base]):
-            W = W @ tf.frame_from_xyzrpy(theta[self._base])
-        if np.any(theta[self._tool]):
-            F = F @ tf.frame_from_xyzrpy(theta[self._tool])
-        theta[self._base], theta[self._tool] = 0.0, 0.0
-        return State(theta, W, F)
+        return folded(self.kernel, theta, state)
 
     def deviations(self, state: State) -> Array:
         """How far each parameter (all) is from where priors expect it."""
@@ -83,6 +77,18 @@ class Evaluator:
     def joint_scatter(self, state: State, joint_sigma: ArrayLike) -> Array:
         """Covariance (n, 6, 6) of the tool's twist from joints that stop with standard deviations ``joint_sigma``."""
         return joint_scatter(self.kernel, state, self.poses, joint_sigma)
+
+
+def folded(kernel: Kernel, theta: Array, state: State) -> State:
+    """A state with parameters ``theta`` (all), whose deviations of base and tool are folded into the references."""
+    theta = theta.copy()
+    references = {"base": state.world_T_base, "tool": state.flange_T_tool}
+    for end, frame in references.items():
+        columns = [kernel.index[f"{end}.{k}"] for k in GEOMETRIC_KINDS]
+        if np.any(theta[columns]):
+            references[end] = frame @ tf.frame_from_xyzrpy(theta[columns])
+            theta[columns] = 0.0
+    return State(theta, references["base"], references["tool"])
 
 
 class CellEvaluator(Evaluator):

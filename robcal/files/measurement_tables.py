@@ -71,6 +71,7 @@ class MeasuredTable:
     loops : kinds of closed loops by name; ``loop`` : (m,) which of them, in that order.
     shared : what the points have in common, where the system states it; it is part of ``covariance``.
     sources : further files that the table was made from.
+    q : (m, N) joint angles that the rows state themselves, rad or m; None where they state none.
     """
 
     kind: Kind
@@ -87,6 +88,7 @@ class MeasuredTable:
     loop: IntArray | None = None
     shared: SharedErrors | None = None
     sources: tuple[Path, ...] = ()
+    q: Array | None = None
 
     def __len__(self) -> int:
         return len(self.pose)
@@ -108,6 +110,7 @@ class MeasuredTable:
             angles=None if self.angles is None else self.angles[kept],
             loop=None if self.loop is None else self.loop[kept],
             shared=None if self.shared is None else self.shared.select(kept),
+            q=None if self.q is None else self.q[kept],
         )
 
 
@@ -136,12 +139,14 @@ def read_measurements(path: Path, pose_names: Sequence[str], kind: Kind | None =
     return measurements_of(read_table(path), pose_names, kind)
 
 
-def measurements_of(table: Table, pose_names: Sequence[str], kind: Kind | None = None) -> MeasuredTable:
-    """The measurements of a table, as :func:`read_measurements` does it."""
+def measurements_of(
+    table: Table, pose_names: Sequence[str], kind: Kind | None = None, q: Array | None = None
+) -> MeasuredTable:
+    """The measurements of a table, as :func:`read_measurements` does it; ``q`` : angles that its rows state."""
     path = table.path
     kind = kind or _kind(table)
     if kind == "constraints":
-        return _constraints(table, pose_names)
+        return replace(_constraints(table, pose_names), q=q)
     needed = {
         "points": ["pose", "target", "x_mm", "y_mm", "z_mm"],
         "sensor_points": ["pose", "target", "x_mm", "y_mm", "z_mm"],
@@ -151,7 +156,7 @@ def measurements_of(table: Table, pose_names: Sequence[str], kind: Kind | None =
     table.require(needed)
     if not len(table):
         raise InvalidInput(f"{path}: lists no measurements")
-    pose, notes = pose_index(table, pose_names)
+    pose = pose_index(table, pose_names)
     target = target_ids(table) if "target" in needed else np.full(len(table), -1, dtype=np.int64)
     keys = ["pose", *(["target"] if "target" in needed else []), *(["cycle"] if table.has("cycle") else [])]
     table.unique(keys)
@@ -169,7 +174,7 @@ def measurements_of(table: Table, pose_names: Sequence[str], kind: Kind | None =
     _check_size(table, values)
     covariates = {name: table.numbers(name) for name in ("cycle", "time_s") if table.has(name)}
     angles = six[:, 3:] if kind == "frames" else None
-    measured = MeasuredTable(kind, path, pose, table.rows, target, values, covariance, covariates, tuple(notes), angles)
+    measured = MeasuredTable(kind, path, pose, table.rows, target, values, covariance, covariates, angles=angles, q=q)
     return _without_empty(measured, pose_names)
 
 
@@ -177,10 +182,10 @@ def _constraints(table: Table, pose_names: Sequence[str]) -> MeasuredTable:
     if not len(table):
         raise InvalidInput(f"{table.path}: lists no constraints")
     number, kinds, values, variance = read_constraints(table)
-    pose, notes = pose_index(table, pose_names)
+    pose = pose_index(table, pose_names)
     none = np.full(len(table), -1, dtype=np.int64)
     return MeasuredTable(
-        "constraints", table.path, pose, table.rows, none, values, variance, {}, tuple(notes), None, kinds, number
+        "constraints", table.path, pose, table.rows, none, values, variance, {}, loops=kinds, loop=number
     )
 
 
@@ -245,8 +250,8 @@ def _kind(table: Table) -> Kind:
     )
 
 
-def pose_index(table: Table, pose_names: Sequence[str]) -> tuple[IntArray, list[str]]:
-    """Rows (m,) of the poses in the table of poses, and a note where some have no measurement."""
+def pose_index(table: Table, pose_names: Sequence[str]) -> IntArray:
+    """Rows (m,) of the poses in the table of poses."""
     place = {name: i for i, name in enumerate(pose_names)}
     cells = table.texts("pose")
     unknown = [cell not in place for cell in cells]
@@ -256,12 +261,17 @@ def pose_index(table: Table, pose_names: Sequence[str]) -> tuple[IntArray, list[
             f"pose '{cells[i]}' is not in the table of poses ({sum(unknown)} such rows): add it there or remove the row"
         ),
     )
-    measured = set(cells)
-    missing = [name for name in pose_names if name not in measured]
-    notes = []
-    if missing:
-        notes.append(f"{len(missing)} poses have no measurement in {table.path.name} ({few(missing)})")
-    return np.array([place[cell] for cell in cells], dtype=np.int64), notes
+    return np.array([place[cell] for cell in cells], dtype=np.int64)
+
+
+def unmeasured(tables: Sequence[MeasuredTable], pose_names: Sequence[str]) -> list[str]:
+    """A note where some poses have no measurement in any of the tables."""
+    if not tables:
+        return []
+    measured = np.unique(np.concatenate([table.pose for table in tables]))
+    missing = np.delete(np.asarray(pose_names, dtype=object), measured)
+    names = " and ".join(dict.fromkeys(table.path.name for table in tables))
+    return [f"{len(missing)} poses have no measurement in {names} ({few(missing.tolist())})"] if len(missing) else []
 
 
 def few(names: Sequence[str]) -> str:

@@ -73,16 +73,25 @@ class YamlDocument:
         return self.lines.get(place)
 
 
-def _walk(node: yaml.Node, place: Location, lines: dict[Location, int], path: Path, count: list[int]) -> None:
-    count[0] += 1
-    if count[0] > MAX_NODES:
-        raise InvalidInput(f"{path}: expands to more than {MAX_NODES} entries (aliases that multiply): write them out")
+def _expanded(node: yaml.Node, sizes: dict[int, int]) -> int:
+    """Entries that a node has with its aliases written out; ``sizes`` by identity, so that none is counted again."""
+    if id(node) not in sizes:
+        sizes[id(node)] = 1  # of an alias inside itself
+        children: list[yaml.Node] = []
+        if isinstance(node, yaml.CollectionNode):
+            pairs = isinstance(node, yaml.MappingNode)
+            children = [child for _, child in node.value] if pairs else node.value
+        sizes[id(node)] = 1 + sum(_expanded(child, sizes) for child in children)
+    return sizes[id(node)]
+
+
+def _walk(node: yaml.Node, place: Location, lines: dict[Location, int], path: Path) -> None:
     if len(place) > MAX_DEPTH:
         raise InvalidInput(f"{path}, line {node.start_mark.line + 1}: nested more than {MAX_DEPTH} levels deep")
     lines.setdefault(place, node.start_mark.line + 1)
     if isinstance(node, yaml.SequenceNode):
         for i, child in enumerate(node.value):
-            _walk(child, (*place, i), lines, path, count)
+            _walk(child, (*place, i), lines, path)
     elif isinstance(node, yaml.MappingNode):
         seen: dict[str, int] = {}
         for key, child in node.value:
@@ -96,7 +105,7 @@ def _walk(node: yaml.Node, place: Location, lines: dict[Location, int], path: Pa
                     f"{path}, line {line}: key '{key.value}' stands twice (first in line {seen[key.value]}): remove one"
                 )
             seen[key.value] = line
-            _walk(child, (*place, key.value), lines, path, count)
+            _walk(child, (*place, key.value), lines, path)
             lines[(*place, key.value)] = line
 
 
@@ -124,7 +133,11 @@ def read_yaml(path: Path) -> YamlDocument:
         node = loader.get_single_node()
         lines: dict[Location, int] = {}
         if node is not None:
-            _walk(node, (), lines, path, [0])
+            if _expanded(node, {}) > MAX_NODES:
+                raise InvalidInput(
+                    f"{path}: expands to more than {MAX_NODES} entries (aliases that multiply): write them out"
+                )
+            _walk(node, (), lines, path)
         data = loader.construct_document(node) if node is not None else None
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark

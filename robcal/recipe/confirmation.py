@@ -4,8 +4,6 @@ A search accepts causes one after the other; beside all that came later one of t
 poses that it was not fitted to. Such a cause is no name for anything: it is told as a remark.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Which robot is delivered: what the diagnosis added has to earn its place on poses that it was not fitted to."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -41,7 +39,7 @@ class Form:
         """Everything together fitted to a recording."""
         return fit(self.model, recording, self.free, self.direct)
 
-    def without(self, names: Sequence[str]) -> Form:
+    def without(self, names: Sequence[str]) -> "Form":
         """The form without some free parameters and the terms that consist of them."""
         gone = set(names)
         terms = tuple(term for term in self.model.terms if not gone.issuperset(term.parameter_names))

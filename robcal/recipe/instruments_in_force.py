@@ -5,8 +5,6 @@ in which robot, worlds, tools and wires are fitted anew, to first order; a stop 
 saw lies in one fold.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -18,8 +16,8 @@ from robcal.calibration.identification import IdentifyOptions
 from robcal.calibration.instruments import IdentifiedInstruments
 from robcal.calibration.instruments.linearised import LinearInstruments, linearised
 from robcal.calibration.joint_log import JointLog
-from robcal.diagnosis.core.fitting import solve
 from robcal.diagnosis.gain.delivered import Gain, blocks_of, gain_of
+from robcal.estimation.minimum_norm import solve
 from robcal.recipe.in_force import FEW, Form, Groups, InForce, contradicted, groups_of, with_terms
 from robcal.transforms import Array
 

@@ -7,8 +7,6 @@ squared errors regressed on squared displacements with non-negative variances (A
 variance for all joints, since few poses tell joints apart poorly.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -5,8 +5,6 @@ The robot speaks in the measuring system's frame as it was at the first pose, an
 last one: a slipped gear stays slipped.
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

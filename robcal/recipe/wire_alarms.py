@@ -16,10 +16,10 @@ from robcal.calibration.instruments import IdentifiedInstruments
 from robcal.calibration.instruments.linearised import LinearInstruments, linearised
 from robcal.calibration.joint_log import JointLog
 from robcal.calibration.wire import LIMITS
-from robcal.diagnosis.core.fitting import solve
 from robcal.diagnosis.core.recording import Recording, observation_data
 from robcal.diagnosis.core.result import Finding
 from robcal.estimation.covariance import cofactor
+from robcal.estimation.minimum_norm import solve
 from robcal.physics.cause import DEVIATION, numeric_sigma
 from robcal.physics.measuring import WIRE_SCALE, measuring_causes
 from robcal.robot.kernel_cache import kernel_of
@@ -54,8 +54,9 @@ def wire_alarms(found: IdentifiedInstruments, log: JointLog, options: IdentifyOp
         return []
     options = options or IdentifyOptions()
     links = _links(robot)
-    believed = {n: options.priors.get(n, BELIEVED_LENGTH) for n in links}
-    far = [n for n in links if abs(robot.values[n]) - USUAL_LENGTH > SURE * np.hypot(_sigma(robot, n), believed[n])]
+    # without a stated prior a link may be off by anything: robots of old drawings are
+    stated = {n: options.priors[n] for n in links if n in options.priors}
+    far = [n for n in stated if abs(robot.values[n]) - USUAL_LENGTH > SURE * np.hypot(_sigma(robot, n), stated[n])]
     told = [f"{n} {1e3 * robot.values[n]:+.2f} +- {1e3 * _sigma(robot, n):.2g} mm" for n in far]
     reason = f"links are off by more than links may be ({', '.join(told)}), which a fault of the wire does"
     best = 0.0

@@ -1,7 +1,5 @@
 """A simulated identification: truth, poses, noise. Not a test module."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Capsules of links: distances against brute force, self-collision, obstacles."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

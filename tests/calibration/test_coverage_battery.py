@@ -1,7 +1,5 @@
 """Monte Carlo: stated intervals hold what they promise (the long form is ``python -m benchmarks.identification``)."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Poses that cannot separate base and tool: named with the remedy, and what can be estimated is estimated."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Parameters that may go back to nominal."""
 
-from __future__ import annotations
-
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st

@@ -1,7 +1,5 @@
 """Identification: truth recovered, honest statistics, named eliminations, mixtures, outliers, clear refusals."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

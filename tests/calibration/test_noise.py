@@ -1,7 +1,5 @@
 """Variance components of simulated scatter."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

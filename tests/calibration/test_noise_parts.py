@@ -1,7 +1,5 @@
 """Measurement noise, scatter of the joints and lack of fit are told apart, and never called by one another's name."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

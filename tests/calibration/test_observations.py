@@ -1,7 +1,5 @@
 """Residuals and derivatives of every operator against differences."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

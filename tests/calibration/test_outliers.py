@@ -1,7 +1,5 @@
 """The rule that tells blunders from misfit."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from robcal.calibration.outliers import suspicious

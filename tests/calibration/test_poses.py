@@ -1,7 +1,5 @@
 """Generator of measuring poses: admissible, informative, as few as needed, in a short and balanced order."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

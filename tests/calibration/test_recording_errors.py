@@ -1,7 +1,5 @@
 """Slips in the recording are named, with the proof; a healthy recording raises no suspicion."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import combinations, permutations
 

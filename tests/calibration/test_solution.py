@@ -1,7 +1,5 @@
 """Elimination and choice on data that say little: distances of random chains, few more numbers than parameters."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Base and tool without a guess, from every kind of observation, exact for exact data."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

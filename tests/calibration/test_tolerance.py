@@ -1,7 +1,5 @@
 """Errors against a tolerance, and what they promise of further poses."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Stated sigmas that the residuals contradict are not those of the weights."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Verification: the thesis' table, honest normalised errors, folds, ISO terms."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Which targets a camera sees, and the information of what it sees against a least-squares solution."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The level of rendered images: what is run, and how its answers are scored."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

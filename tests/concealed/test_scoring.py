@@ -1,7 +1,5 @@
 """Scores on invented answers: what counts as the same cause, as covered, as gained."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Small surveys and stations of the fixtures at the level of marks, adjusted and ready for the diagnosis."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Causes that are not accepted however well they fit."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

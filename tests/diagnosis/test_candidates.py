@@ -1,7 +1,5 @@
 """Tangent columns of causes at a fit."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

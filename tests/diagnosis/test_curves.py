@@ -1,7 +1,5 @@
 """Irregular error curves of joints: found, alike where they are, and not taken for what has a name."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -11,7 +9,9 @@ from robcal.calibration.observations import FrameObservations
 from robcal.diagnosis.core.fitting import Accepted, Fit, fit, terms_of
 from robcal.diagnosis.core.recording import Recording
 from robcal.diagnosis.diagnose import diagnose
-from robcal.diagnosis.search.curves import LEAST_POSES, find_curves, frozen_terms, likenesses, nested_errors
+from robcal.diagnosis.search.curves import LEAST_POSES, find_curves, frozen_terms, nested_errors
+from robcal.diagnosis.search.folded_normals import Folded
+from robcal.diagnosis.search.likeness import likenesses
 from robcal.physics.angle_error_curve import periodic_curve
 from robcal.physics.site import Joint
 from robcal.robot.kernel import Kernel
@@ -71,6 +71,35 @@ def test_curves_of_all_joints_are_found(uneven: tuple[Recording, Fit, np.ndarray
         both = of_joint(found.accepted, k + 1, q)
         truth, reported = (y - slow @ np.linalg.lstsq(slow, y, rcond=None)[0] for y in (added[:, k], both))
         assert np.corrcoef(truth, reported)[0, 1] > 0.9
+
+
+@pytest.mark.slow
+def test_a_curve_is_shared_by_those_joints_alone_that_have_it() -> None:
+    s = scenario(5, n=400)
+    q = s.poses.q
+    added = np.stack([pattern(1 if k < 3 else k, q[:, k] + 0.7 * k) for k in range(6)], axis=1)
+    recording, obs = recorded(q + added, s)
+    shared, *own = find_curves(fitted(recording, obs, s), recording).accepted
+    assert shared.cause.where == "axis1, axis2, axis3"
+    assert len(own) == 6
+
+
+def test_blocks_weigh_by_what_the_others_tell_of_them() -> None:
+    rng = np.random.default_rng(0)
+    X = np.column_stack([rng.normal(size=(60, 2)), 0.5 * rng.normal(size=(60, 3))])
+    label = np.repeat(np.arange(4), 15)
+    X[label != 3, 4] = 0.0  # the last block alone shows the last column
+    r = X @ np.array([1.0, -2.0, 1.5, -0.5, 3.0]) + rng.normal(size=60)
+    blocks = [(A.T @ A, A.T @ b, float(b @ b), len(b)) for k in range(4) for A, b in [(X[label == k], r[label == k])]]
+    variance = 1.3
+    found = Folded(tuple(blocks), np.array([2, 5]), variance).deviance([0])
+    ridge = np.concatenate([np.full(2, 1e-9 * np.max(np.diag(X.T @ X))), np.full(3, variance)])
+    for k in range(4):
+        A, b, test = X[label != k], r[label != k], X[label == k]
+        C = np.linalg.inv(A.T @ A + np.diag(ridge))
+        S = variance * (np.eye(15) + test @ C @ test.T)
+        left = r[label == k] - test @ (C @ (A.T @ b))
+        assert found[k] == pytest.approx(left @ np.linalg.solve(S, left) + np.linalg.slogdet(S)[1])
 
 
 def of_joint(accepted: tuple[Accepted, ...], number: int, q: np.ndarray) -> np.ndarray:

@@ -1,7 +1,5 @@
 """Whitening of errors that the rows of a pose share."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from robcal.diagnosis.core.decorrelation import CommonNoise, SharedNoise

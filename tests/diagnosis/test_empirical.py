@@ -1,7 +1,5 @@
 """Laws for what has no name: smooth inside the recorded values, constant beyond them, readable by the kernel."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

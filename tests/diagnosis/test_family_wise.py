@@ -1,7 +1,5 @@
 """LinearCause-wise level with the tails that residuals have."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

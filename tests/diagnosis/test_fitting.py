@@ -1,7 +1,5 @@
 """The fit of a robot together with causes ends where robot and causes agree."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Evidence of causes over their grids."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +10,7 @@ from scipy import special
 from robcal.diagnosis.scan.posterior import posterior
 from robcal.diagnosis.scan.statistics import ScanResult
 from robcal.physics.cause import LinearCause
-from robcal.physics.joint import BACKLASH
+from robcal.physics.joint_play import BACKLASH
 
 BLANK = LinearCause(BACKLASH, "axis1", "z", ("width",), (1e-4,), lambda v, c: {})
 

@@ -1,7 +1,5 @@
 """Variance components of a recording: the stated covariance's factor, the joints' repeatability, shared errors."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A region kept out: chosen at the end of the space, its errors predicted from the others."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

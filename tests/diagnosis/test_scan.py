@@ -1,7 +1,5 @@
 """The scan: projection, probabilities under the null, evidence."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

@@ -1,7 +1,5 @@
 """Numbers of targets exchanged, from distances alone."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from robcal.calibration.observations import PointObservations

@@ -1,7 +1,5 @@
 """Joints without load: their elasticity is assumed where a cause may act through it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -11,6 +11,7 @@ from pipeline.campaign_schema import CampaignEntry
 from robcal.files.body_file import BodyEntry
 from robcal.files.camera_file import CameraEntry
 from robcal.files.line_cameras import LineCamerasEntry
+from robcal.files.reseau_file import ReseauEntry
 from robcal.files.robot_file import RobotEntry
 from robcal.physics.library import kinds
 
@@ -34,7 +35,7 @@ def keys(entry: type[BaseModel]) -> set[str]:
     return found
 
 
-@pytest.mark.parametrize("entry", [CampaignEntry, RobotEntry, BodyEntry, CameraEntry, LineCamerasEntry])
+@pytest.mark.parametrize("entry", [CampaignEntry, RobotEntry, BodyEntry, CameraEntry, LineCamerasEntry, ReseauEntry])
 def test_every_key_stands_on_the_page(entry: type[BaseModel]) -> None:
     missing = {key for key in keys(entry) if not re.search(rf"\b{key}\b", CODE)}
     assert not missing

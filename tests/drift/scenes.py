@@ -1,7 +1,5 @@
 """A robot that warms up in front of a sphere, by the fixtures alone, and its files."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

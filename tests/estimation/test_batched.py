@@ -1,7 +1,5 @@
 """Many small problems at once: each ends as it would alone, and nothing it does touches the others."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Statistics of an estimate against the inverse normal matrix and the chi-square distribution."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Elimination of dependent parameters on columns whose dependence is known."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The solver on problems whose answer is known."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

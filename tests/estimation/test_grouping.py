@@ -1,7 +1,5 @@
 """Sums over groups and whitening matrices against their definitions."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

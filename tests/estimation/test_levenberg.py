@@ -1,7 +1,5 @@
 """The damped loop and reduced normal equations on problems whose answer is known."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

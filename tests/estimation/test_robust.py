@@ -1,7 +1,5 @@
 """Weights of robust estimation belong to their costs."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 

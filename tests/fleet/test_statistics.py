@@ -1,7 +1,5 @@
 """Fleets: outlying robots are found at the stated rate of false alarms; batches; changes of one robot."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The tests' renderer: ellipses and ring codes by supersampling, Gaussian blur, noise. Independent of robcal."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

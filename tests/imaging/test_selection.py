@@ -1,7 +1,5 @@
 """From candidates to dots: what is found, what is refused and under which reason, what statistics the dots give."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

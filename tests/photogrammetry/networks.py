@@ -1,7 +1,5 @@
 """Simulated survey networks for the tests; dots are projected as polygons, not by the library's formulas."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """Simulated stations for the tests: cameras that watch a plate in many poses, with their own projection."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -4,8 +4,6 @@ Skipped where the recordings are not beside the repository. Expected values: REA
 adjustments: sigma0 0.155 .. 0.1615 px, redundancy 3725).
 """
 
-from __future__ import annotations
-
 import csv
 from collections import defaultdict
 from pathlib import Path

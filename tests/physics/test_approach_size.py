@@ -1,7 +1,5 @@
 """An error that grows with a joint's last move: found in a simulated campaign, with its size."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The library: complete, finite, and reported in the contract's names and units."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Sag of an arm whose masses are not stated: found, with its axes, and predicted where nobody measured."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

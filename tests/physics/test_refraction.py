@@ -1,7 +1,5 @@
 """Bent lines of sight: the law seen from a place that is not known, and from the origin."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

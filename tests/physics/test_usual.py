@@ -1,7 +1,5 @@
 """Usual sizes of deviations."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

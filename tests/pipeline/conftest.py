@@ -1,7 +1,5 @@
 """Small campaigns: at the level of points and frames, and one rendered in images."""
 
-from __future__ import annotations
-
 import csv
 import shutil
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Many campaigns: batch on cores and on a Dask cluster, fleet, history."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -1,7 +1,5 @@
 """Inputs as people really make them, each through the command; a folder of its own beside the project holds them."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

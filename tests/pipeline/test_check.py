@@ -1,7 +1,5 @@
 """`pipeline check`: everything at once, faults apart from doubts, nothing written."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

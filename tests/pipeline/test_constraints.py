@@ -1,7 +1,5 @@
 """Closed loops from a table: a tip held at a point, on a plane, by a bar identifies a robot without any instrument."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -17,6 +17,7 @@ from pipeline.stages.identify import load_calibrated
 from robcal.files.tables import read_table
 from robcal.recipe.agreement import disagreements
 from robcal.recipe.verification import verify_robot
+from robcal.robot.model import Term
 
 
 @pytest.mark.parametrize("level", ["frames", "points"])
@@ -65,3 +66,11 @@ def test_results_that_contradict_one_another_are_told(tmp_path: Path) -> None:
     assert len(disagreements(found, robot, poses, identification.recording, wrong)) == 2
     other = replace(robot, model=robot.model.with_parameters({"axis2.x": 1e-3}))
     assert "predict gives" in disagreements(found, other, poses, identification.recording)[0]
+    lag = Term("lag", "axis1", "q", "width*approach1", {"width": 2e-4})
+    late = replace(robot, model=robot.model.with_terms((*robot.model.terms, lag)))
+    guessed = replace(poses, inferred=(0,))
+    freed = verify_robot(robot.model, identification, late, guessed, freed=identification.recording)
+    assert freed.recorded is not None
+    assert freed.unstated is not None
+    assert freed.delivered.coverage_95 == freed.unstated.coverage_95 != freed.recorded.coverage_95
+    assert freed.delivered.normalised == pytest.approx(freed.unstated.normalised)

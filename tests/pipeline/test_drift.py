@@ -18,6 +18,7 @@ from typer.testing import CliRunner
 from pipeline.cli import app
 from robcal.files.tables import read_table
 from tests.drift.scenes import Scene, make_scene, write_readings, write_run
+from tests.pipeline.browser import needs_browser, opened
 
 
 @pytest.fixture(scope="module")
@@ -247,24 +248,13 @@ def test_a_state_is_not_begun_twice_nor_without_a_run(made: Path, state: Path, t
 
 
 @pytest.mark.browser
+@needs_browser
 def test_the_page_opens_in_a_browser(made: Path, state: Path, tmp_path: Path) -> None:
-    playwright = pytest.importorskip("playwright.sync_api")
-    chromium = shutil.which("chromium")
-    if chromium is None:
-        pytest.skip("needs Chromium")
     for file in files(made):
         call("add", state, file)
     page_file = tmp_path / "drift.html"
     call("status", state, "--page", page_file)
-    with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
-        page = browser.new_page()
-        faults: list[str] = []
-        page.on("pageerror", lambda error: faults.append(str(error)))
-        page.on("request", lambda request: faults.append(request.url) if request.url.startswith("http") else None)
-        page.goto(page_file.as_uri())
-        page.wait_for_function("document.documentElement.dataset.drawn === '3'", timeout=60_000)
-        assert "5 tours" in page.inner_text("body")
-        assert page.locator(".plot .main-svg").count() >= 3
-        browser.close()
-    assert not faults
+    page = opened(page_file)
+    assert page["problems"] == page["outside"] == []
+    assert int(page["plots"]) == int(page["drawn"]) == page["shown"] == 3
+    assert "5 tours" in page["text"]

@@ -1,7 +1,5 @@
 """What a run exports: C that says what predict says, also of terms of a diagnosis; programs of controllers."""
 
-from __future__ import annotations
-
 import csv
 import ctypes
 import json

@@ -1,7 +1,5 @@
 """Camera and robot files of other programs: read with the same numbers, or refused with the remedy."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from dataclasses import astuple

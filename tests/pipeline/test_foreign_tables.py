@@ -1,7 +1,5 @@
 """Tables and joint logs of other programs: the same numbers as in the project's own, or a sentence with the remedy."""
 
-from __future__ import annotations
-
 import csv
 import math
 from collections.abc import Callable

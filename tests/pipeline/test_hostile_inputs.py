@@ -1,7 +1,5 @@
 """What an adversary, or another operating system, puts into a campaign: through the commands, one sentence, no harm."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import struct
@@ -293,7 +291,7 @@ def test_files_of_operating_systems_beside_the_images(image_campaign: Path, dete
         (b"format: robcal/campaign-1\nname: x\nmeasurements: " + b"a" * 5000, "at most 1000"),
         (b"a: &a [x, x]\n" + ALIASES, "aliases"),
         (b"format: !!python/object/apply:os.system ['true']\n", "not valid YAML"),
-        (b"[" * 5000, "not valid YAML"),
+        (b"[" * 1200, "not valid YAML"),
         ("format: robcal/campaign-1\nname: Zellä\n".encode("latin-1"), "line 2: not UTF-8"),
     ],
 )

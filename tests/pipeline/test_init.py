@@ -1,7 +1,5 @@
 """`pipeline init`: a campaign.yaml from what lies in a folder, which `pipeline check` accepts."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Campaigns with several instruments: from their files to result.json and predict --instrument; truth from fixtures."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Several instruments diagnosed: a fault of a wire is put right; what one shows and another contradicts is its own."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

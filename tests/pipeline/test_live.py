@@ -1,7 +1,5 @@
 """`pipeline live`: a campaign over TCP; a connection torn at any byte loses and doubles nothing."""
 
-from __future__ import annotations
-
 import csv
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Small camera movements in the stages, and what robot and station together tell."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

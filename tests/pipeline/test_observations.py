@@ -1,7 +1,5 @@
 """What the robot stages work on."""
 
-from __future__ import annotations
-
 import csv
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Command poses: a description of a cell in, a table of poses out that a campaign can read; errors in one sentence."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """`pipeline program`: files in, files out, and nothing written where anything is wrong."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

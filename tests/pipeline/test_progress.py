@@ -1,7 +1,5 @@
 """Dry runs, interruption, progress, version, completion, and what programs are told."""
 
-from __future__ import annotations
-
 import io
 import json
 import logging

@@ -1,7 +1,5 @@
 """The report's content: what it says is what the run holds, nothing from outside gets in or out."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

@@ -1,7 +1,5 @@
 """The report as PDF."""
 
-from __future__ import annotations
-
 import json
 import os
 from pathlib import Path
@@ -12,7 +10,7 @@ from typer.testing import CliRunner
 from pipeline.cli import app
 from pipeline.report import pdf
 from pipeline.report.pdf import NoPrinter, print_report
-from tests.pipeline.test_report_browser import CHROMIUM
+from tests.pipeline.browser import CHROMIUM
 
 
 def test_without_a_browser_one_sentence_says_what_to_do(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

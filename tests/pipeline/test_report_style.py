@@ -1,7 +1,5 @@
 """How numbers and plots of the report are written."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

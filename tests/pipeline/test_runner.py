@@ -136,17 +136,24 @@ def kill_in(campaign: Path, out: Path, stage: str, when: str, until: str = "veri
     assert child.exitcode == -signal.SIGKILL
 
 
+@pytest.fixture(scope="module")
+def whole(point_campaign_source: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, object]:
+    """Results of a run that nothing disturbed."""
+    out = tmp_path_factory.mktemp("whole") / "run"
+    run_campaign(point_campaign_source, out, until="verify", workers=1)
+    return results(out)
+
+
 @pytest.mark.parametrize("when", ["first write", "before the record"])
 @pytest.mark.parametrize("stage", ["measure", "frames", "identify", "verify"])
 def test_kill_minus_nine_and_resume_gives_the_same_result(
-    point_campaign: Path, tmp_path: Path, stage: str, when: str
+    point_campaign: Path, whole: dict[str, object], tmp_path: Path, stage: str, when: str
 ) -> None:
-    run_campaign(point_campaign, tmp_path / "whole", until="verify", workers=1)
     kill_in(point_campaign, tmp_path / "killed", stage, when)
     assert Run(tmp_path / "killed").record(stage) is None
     resumed = run_campaign(point_campaign, tmp_path / "killed", until="verify", workers=1)
     assert resumed.ran[0] == stage
-    assert results(tmp_path / "killed") == results(tmp_path / "whole")
+    assert results(tmp_path / "killed") == whole
 
 
 def test_killed_in_diagnosis_verification_and_report(frame_campaign: Path, tmp_path: Path) -> None:

@@ -1,7 +1,5 @@
 """A sensor in the hand, from poses to a campaign and back: calibrated by its readings, the next poses are square."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Poses of a sensor in the hand, from their description to the table: square, exact, free, and what is not reached."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A calibration sphere from rendered photographs to coordinates: dots on a curved surface, seen from one side each."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Mastering through the marks of a station of which one camera is left: resections, in the world of the calibration."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Tags of TIFF files: pixels as they are stored, whatever the tags; what is no single grey image is told."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 

@@ -4,8 +4,6 @@ In the programs `@F3:a:b@` is posture 3 as a Cartesian target with tool a in bas
 status and turn in KRL, `@T:a@` and `@B:b@` the numbers of a tool and a base, in the dialect's own form.
 """
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

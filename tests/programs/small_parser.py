@@ -4,8 +4,6 @@ Written apart from the library and by other means (regular expressions, one pass
 offsets, and the last tool and base that the text sets. Frames in m, angles in rad.
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Programs of every dialect: corrected right, by a second reader and the robot's own forward model, or refused."""
 
-from __future__ import annotations
-
 import re
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Random and typical chains for the tests of robot and calibration."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from robcal.robot.model import Frame, Payload, RobotModel, Term

@@ -1,7 +1,5 @@
 """Compensation: the real tool comes where it is wanted, to first order in one step and exactly by iteration."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Denavit-Hartenberg tables against their own closed form."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Functions of the gravity regressor against the moments of the statics."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Inverse kinematics: FK(IK) = identity for every ready robot and for random arms, branches, limits, reasons."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

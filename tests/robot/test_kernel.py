@@ -1,7 +1,5 @@
 """The kernel against differences, an independent library, and its own laws."""
 
-from __future__ import annotations
-
 import pickle
 from typing import Any
 

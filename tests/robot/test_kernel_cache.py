@@ -1,7 +1,5 @@
 """Kernels that share a graph give what kernels of their own give."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Parallelograms and four-bars against a witness that closes circles and minimises energy."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The four subproblems against the conditions that they solve, and the structures that they are used for."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The expression language: what it accepts, what it refuses, and that numpy and graph agree."""
 
-from __future__ import annotations
-
 import casadi as ca
 import numpy as np
 import pytest

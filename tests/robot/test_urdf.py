@@ -1,7 +1,5 @@
 """URDF in and out: against pinocchio, and as a round trip."""
 
-from __future__ import annotations
-
 from xml.etree import ElementTree
 
 import numpy as np

@@ -6,9 +6,8 @@ Gaussian process with period one turn, and the poses of whole blocks that were k
 true. A curve that a few waves describe as well is left to the causes with a name.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 
@@ -17,9 +16,11 @@ from robcal.diagnosis.core.recording import Recording
 from robcal.diagnosis.gain.heldout import folds, rms
 from robcal.diagnosis.scan.statistics import log_f_probability
 from robcal.diagnosis.scan.tangents import Tangents, tangents
-from robcal.diagnosis.search.shared_curve import Likeness, joined, maker, pattern, refined
-from robcal.physics.angle_error_curve import Placed, beside_shared, periodic_curve
-from robcal.physics.cause import Array, LinearCause, RobotCause
+from robcal.diagnosis.search.folded_normals import Folded, Normals, amplitudes, folded, scaled, variance_with
+from robcal.diagnosis.search.likeness import Likeness, irregularity, likenesses, pattern
+from robcal.diagnosis.search.shared_trial import CurvesOnTrial, accepted_with, with_shared
+from robcal.physics.angle_error_curve import periodic_curve
+from robcal.physics.cause import Array, RobotCause
 from robcal.physics.site import Joint, RobotSite
 from robcal.robot.model import Term
 
@@ -33,18 +34,10 @@ GAIN = 0.7
 """Share of the sum of squares at kept-out poses below which the curves must come."""
 LEAST_GAIN = 0.03
 """Share of that sum of squares by which the kept-out poses must miss the curve of a joint for it to count."""
-WAVES = 2
-HIGHEST_WAVE = 60.0
 IRREGULAR = 0.35
 """Share of a curve's variance that so many waves leave: below, the curve is regular and has a name."""
-BUMPS_SHARED = 72
-"""Bumps a turn of a curve that joints share: all of them together show its finest waves."""
-OWN_SIZES = (0.3, 0.6, 0.1)
-"""Sizes, in those of a curve, of what joints that share one may differ by; the kept-out poses choose."""
 HELD_PARTS = 20
 """Bumps in one expression of a curve that is held."""
-LEAST_SHARED = 2
-"""Joints that must have a curve in common."""
 SEVERAL = 2
 """With so many irregular joints all joints get a curve."""
 
@@ -88,132 +81,80 @@ def find_curves(present: Fit, recording: Recording) -> Curves:
     site = RobotSite(present.model, at.variables, frozenset(present.free), frozenset())
     joints = [j for j in site.joints if not j.prismatic and site.varies(f"q{j.number}", 0.5)]
     label = folds(recording)[present.row_pose]
-    best: tuple[float, _Folded, list[RobotCause], list[Array]] | None = None
-    for count in BUMPS_A_TURN:
-        causes = [periodic_curve(j, site.variables[f"q{j.number}"], count) for j in joints]
-        columns = [at.columns(f, f.grid[0]) * f.sizes(f.grid[0]) for f in causes]
-        visited = sum(_visited(site.variables[f"q{j.number}"], count) for j in joints)
-        if ROWS_A_BUMP * visited > len(present.residual):
-            break
-        folded = _folded(present, columns, label)
-        after = folded.kept_out(range(len(columns)))
-        if best is None or after < best[0]:
-            best = after, folded, causes, columns
+    best = _best_scale(present, at, site, joints, label)
     if best is None:
         return Curves()
-    after, folded, causes, columns = best
-    before = folded.kept_out(())
-    if after > GAIN * before:
+    keep = _proved(best, present, [site.variables[f"q{j.number}"] for j in joints])
+    if not keep:
         return Curves()
-    everyone = range(len(columns))
-    matters = [folded.kept_out([j for j in everyone if j != k]) - after > LEAST_GAIN * before for k in everyone]
-    values = _solve(present, columns)
+    joints_kept, angles = [joints[k] for k in keep], [site.variables[f"q{joints[k].number}"] for k in keep]
+    group = CurvesOnTrial(present, at, label, [best.causes[k] for k in keep], [best.columns[k] for k in keep])
+    alone = accepted_with(present, group.causes, group.columns)
+    alike = likenesses(alone, angles)
+    chosen = with_shared(group, pattern(joints_kept, alike), joints_kept, len(joints))
+    accepted, used = (alone, group.columns) if chosen is None else chosen
+    bumps = sum(_visited(q, c.shape[1]) for q, c in zip(angles, group.columns, strict=True))
+    shares, p_value = _significance(present, accepted, used, bumps)
+    return Curves(accepted, shares, alike if chosen is None else (), p_value)
+
+
+@dataclass(frozen=True)
+class _Scale:
+    """Curves of all joints with one number of bumps a turn: their causes, scaled columns and folds, and the sum of
+    squares that they leave at kept-out poses."""
+
+    causes: list[RobotCause]
+    columns: list[Array]
+    folds: Folded
+    after: float
+
+
+def _best_scale(present: Fit, at: Tangents, site: RobotSite, joints: Sequence[Joint], label: Array) -> _Scale | None:
+    """The number of bumps that kept-out poses choose, as many as the recording allows; None if it allows none."""
+    best: _Scale | None = None
+    angles = [site.variables[f"q{j.number}"] for j in joints]
+    for count in BUMPS_A_TURN:
+        causes = [periodic_curve(j, q, count) for j, q in zip(joints, angles, strict=True)]
+        columns = [at.columns(f, f.grid[0]) * f.sizes(f.grid[0]) for f in causes]
+        if ROWS_A_BUMP * sum(_visited(q, count) for q in angles) > len(present.residual):
+            break
+        parts = folded(present, columns, label)
+        after = parts.kept_out(range(len(columns)))
+        if best is None or after < best.after:
+            best = _Scale(causes, columns, parts, after)
+    return best
+
+
+def _proved(scale: _Scale, present: Fit, angles: Sequence[Array]) -> list[int]:
+    """Joints (by number) that have an irregular curve; none where kept-out poses do not prove any."""
+    before, everyone = scale.folds.kept_out(()), range(len(scale.columns))
+    if scale.after > GAIN * before:
+        return []
+    without = (scale.folds.kept_out([j for j in everyone if j != k]) for k in everyone)
+    matters = [square - scale.after > LEAST_GAIN * before for square in without]
+    values = amplitudes(present, scale.columns)
     irregular = [
         k
-        for k in everyone
-        if matters[k]
-        and _irregularity(
-            causes[k], values[k] * causes[k].sizes(causes[k].grid[0]), site.variables[f"q{joints[k].number}"]
-        )
-        > IRREGULAR
+        for k, cause in enumerate(scale.causes)
+        if matters[k] and irregularity(cause, values[k] * cause.sizes(cause.grid[0]), angles[k]) > IRREGULAR
     ]
     # where it is the make of the joints, all have it, also those whose few angles do not show how irregular it is
     keep = irregular if len(irregular) < SEVERAL else list(everyone)
-    if not keep or folded.kept_out(keep) > GAIN * before:
-        return Curves()
-    alone = _accepted(present, [causes[k] for k in keep], [columns[k] for k in keep])
-    alike = likenesses(alone, [site.variables[f"q{joints[k].number}"] for k in keep])
-    group = _Group(present, at, label, [causes[k] for k in keep], [columns[k] for k in keep])
-    chosen = _with_shared(group, pattern([joints[k] for k in keep], alike), [joints[k] for k in keep], len(joints))
-    accepted, used = (alone, group.columns) if chosen is None else chosen
+    return [] if not keep or scale.folds.kept_out(keep) > GAIN * before else keep
+
+
+def _significance(
+    present: Fit, accepted: Sequence[Accepted], columns: Sequence[Array], bumps: int
+) -> tuple[tuple[float, ...], float]:
+    """Shares of the sum of squares that the curves explain, and the p-value of all together, for all scales tried."""
     r = present.residual
     square = float(r @ r)
-    parts = [c @ (item.values / item.cause.sizes(item.constants)) for c, item in zip(used, accepted, strict=True)]
+    parts = [c @ (item.values / item.cause.sizes(item.constants)) for c, item in zip(columns, accepted, strict=True)]
     shares = tuple(float(np.clip(part @ r / square, 0.0, 1.0)) for part in parts)
     left = r - np.sum(parts, axis=0)
-    count = sum(_visited(site.variables[f"q{joints[k].number}"], columns[k].shape[1]) for k in keep)
-    log_p = log_f_probability(
-        np.array([square - left @ left]), np.array([count]), np.array([square]), len(r) - present.jacobian.shape[1]
-    )
-    return Curves(
-        accepted, shares, alike if chosen is None else (), float(min(1.0, len(BUMPS_A_TURN) * np.exp(log_p[0])))
-    )
-
-
-@dataclass(frozen=True)
-class _Group:
-    """Curves of joints on trial: where they are linearised, folds of the rows, causes and their scaled columns."""
-
-    present: Fit
-    at: Tangents
-    label: Array
-    causes: Sequence[RobotCause]
-    columns: Sequence[Array]
-
-
-def _accepted(present: Fit, causes: Sequence[RobotCause], columns: Sequence[Array]) -> tuple[Accepted, ...]:
-    """Causes with the amplitudes that fit, scaled columns (m, c) each."""
-    values = _solve(present, columns)
-    return tuple(
-        Accepted(f, f.grid[0], v * f.sizes(f.grid[0]), np.zeros((len(v), len(v))))
-        for f, v in zip(causes, values, strict=True)
-    )
-
-
-@dataclass(frozen=True)
-class _Shared:
-    """A pattern with its curve on trial: sum of squares at kept-out poses, size of what joints differ by."""
-
-    kept_out: float
-    size: float
-    placed: tuple[Placed, ...]
-    cause: RobotCause
-    columns: tuple[Array, ...]
-
-
-def _with_shared(
-    group: _Group, placed: Sequence[Placed], joints: Sequence[Joint], count: int
-) -> tuple[tuple[Accepted, ...], list[Array]] | None:
-    """One curve for the joints of a pattern, and what each differs by, where that predicts kept-out poses better."""
-    if len(placed) < LEAST_SHARED:
-        return None
-    make = maker(BUMPS_SHARED, group.at.variables, count)
-
-    def solve(columns: Sequence[Array]) -> list[Array]:
-        return _solve(group.present, columns)
-
-    placed = refined(placed, make, group.at, solve, _beside(group, placed, OWN_SIZES[0]))
-    found = _tried(group, placed, make, OWN_SIZES[0])
-    for joint in (j for j in joints if j.where not in {p.joint.where for p in placed}):
-        # joints whose own poses show too little of their curve to tell that it is the same
-        others = [c for f, c in zip(group.causes, found.columns[1:], strict=True) if f.where != joint.where]
-        seen = joined(group.present, group.at, found.cause, joint, found.columns[0], others, _solve)
-        if seen is not None:
-            more = (*found.placed, seen)
-            more = refined(more, make, group.at, solve, _beside(group, more, found.size))
-            found = min(found, _tried(group, more, make, found.size), key=lambda t: t.kept_out)
-    trials = [found, *(_tried(group, found.placed, make, size) for size in OWN_SIZES[1:])]
-    found = min(trials, key=lambda t: t.kept_out)
-    alone = _folded(group.present, group.columns, group.label).kept_out(range(len(group.columns)))
-    if found.kept_out > alone:
-        return None
-    members = {p.joint.where for p in found.placed}
-    causes = [beside_shared(f, found.size) if f.where in members else f for f in group.causes]
-    return _accepted(group.present, [found.cause, *causes], found.columns), list(found.columns)
-
-
-def _beside(group: _Group, placed: Sequence[Placed], size: float) -> list[Array]:
-    """Scaled columns of the joints' own curves, `size` times as large for those that share one."""
-    members = {p.joint.where for p in placed}
-    return [c * (size if f.where in members else 1.0) for f, c in zip(group.causes, group.columns, strict=True)]
-
-
-def _tried(group: _Group, placed: tuple[Placed, ...], make: Callable[..., RobotCause], size: float) -> _Shared:
-    """A pattern beside curves of all joints, those of its members `size` times as large."""
-    own, cause = _beside(group, placed, size), make(placed)
-    common = group.at.columns(cause, cause.grid[0]) * cause.sizes(cause.grid[0])
-    after = _folded(group.present, [common, *own], group.label).kept_out(range(len(own) + 1))
-    return _Shared(after, size, placed, cause, (common, *own))
+    freedom = len(r) - present.jacobian.shape[1]
+    log_p = log_f_probability(np.array([square - left @ left]), np.array([bumps]), np.array([square]), freedom)
+    return shares, float(min(1.0, len(BUMPS_A_TURN) * np.exp(log_p[0])))
 
 
 def _visited(angles: Array, bumps: int) -> int:
@@ -234,13 +175,6 @@ def frozen_terms(item: Accepted) -> tuple[Term, ...]:
     )
 
 
-def curve(item: Accepted, angles: Array) -> Array:
-    """Value (n,) of an accepted curve at angles (n,) of its joint, rad."""
-    name = item.cause.covariates[0]
-    bases = item.cause.laws(item.constants)
-    return np.asarray(np.sum([v * b.value({name: angles}) for b, v in zip(bases, item.values, strict=True)], axis=0))
-
-
 def nested_errors(
     present: Fit, recording: Recording, accepted: Sequence[Accepted], verify: Recording | None
 ) -> tuple[float, ...]:
@@ -250,16 +184,16 @@ def nested_errors(
     """
     at = tangents(present, recording)
     sizes = np.concatenate([item.cause.sizes(item.constants) for item in accepted])
-    X = np.column_stack([_scaled(present), *(at.columns(a.cause, a.constants) for a in accepted)])
+    X = np.column_stack([scaled(present), *(at.columns(a.cause, a.constants) for a in accepted)])
     p = len(present.free)
     X[:, p:] *= sizes
     r = present.residual
     ends = p + np.cumsum([0, *(len(a.values) for a in accepted)])
-    variance = _variance(present, X, X.T @ X, X.T @ r, p)
+    variance = variance_with(present, X, X.T @ X, X.T @ r, p)
 
     def solved(rows: Array, end: int) -> Array:
         A = X[rows, :end]
-        return _Normals(A.T @ A, A.T @ r[rows], p).solve(variance)
+        return Normals(A.T @ A, A.T @ r[rows], p).solve(variance)
 
     def error(of: Recording, left: Array, frames: Array) -> float:
         return rms(of.unwhiten(left[:, None], frames)[:, :3, 0])
@@ -292,146 +226,3 @@ def _at_other_poses(present: Fit, recording: Recording, accepted: Sequence[Accep
     there = replace(present, inputs=inputs, frames=frames, residual=residual, jacobian=jacobian, row_pose=row_pose)
     at = tangents(there, recording)
     return there, np.column_stack([jacobian, *(at.columns(a.cause, a.constants) for a in accepted)])
-
-
-@dataclass(frozen=True)
-class _Normals:
-    """Normal equations of the fitted parameters and of columns whose amplitudes have a unit prior."""
-
-    gram: Array
-    right: Array
-    fitted: int
-
-    def solve(self, variance: float) -> Array:
-        """Parameters and amplitudes; the prior weighs as the variance factor says."""
-        ridge = np.full(len(self.right), 1e-9 * np.max(np.diag(self.gram)))
-        ridge[self.fitted :] = variance
-        return np.linalg.solve(self.gram + np.diag(ridge), self.right)
-
-
-def _scaled(present: Fit) -> Array:
-    size = np.linalg.norm(present.jacobian, axis=0)
-    return present.jacobian / np.where(size > 0, size, 1.0)
-
-
-@dataclass(frozen=True)
-class _Folded:
-    """Normal equations of each fold, and in them the places of the fitted parameters and of each joint's columns."""
-
-    folds: tuple[tuple[Array, Array, float], ...]
-    ends: Array
-    variance: float
-
-    def kept_out(self, joints: Iterable[int]) -> float:
-        """sum of squares of the residuals that the other folds predict with the curves of the given joints."""
-        fitted = int(self.ends[0])
-        at = np.concatenate([np.arange(fitted), *(np.arange(self.ends[k], self.ends[k + 1]) for k in joints)])
-        gram = np.sum([f[0] for f in self.folds], axis=0)[np.ix_(at, at)]
-        right = np.sum([f[1] for f in self.folds], axis=0)[at]
-        total = 0.0
-        for N, b, square in self.folds:
-            here, own = N[np.ix_(at, at)], b[at]
-            x = _Normals(gram - here, right - own, fitted).solve(self.variance)
-            total += square - 2.0 * float(x @ own) + float(x @ here @ x)
-        return total
-
-
-def _folded(present: Fit, columns: Sequence[Array], label: Array) -> _Folded:
-    fitted = _scaled(present)
-    X, r = np.column_stack([fitted, *columns]), present.residual
-    folds = []
-    for fold in np.unique(label):
-        A, b = X[label == fold], r[label == fold]
-        folds.append((A.T @ A, A.T @ b, float(b @ b)))
-    ends = np.cumsum([fitted.shape[1], *(c.shape[1] for c in columns)])
-    gram, right = np.sum([f[0] for f in folds], axis=0), np.sum([f[1] for f in folds], axis=0)
-    return _Folded(tuple(folds), ends, _variance(present, X, gram, right, fitted.shape[1]))
-
-
-def _variance(present: Fit, X: Array, gram: Array, right: Array, fitted: int) -> float:
-    """Variance factor with the columns in the model: two rounds, from that without."""
-    variance = present.variance_factor
-    for _ in range(2):
-        left = present.residual - X @ _Normals(gram, right, fitted).solve(variance)
-        variance = float(left @ left) / max(len(left) - X.shape[1], 1)
-    return variance
-
-
-def _solve(present: Fit, columns: Sequence[Array]) -> list[Array]:
-    fitted = _scaled(present)
-    X = np.column_stack([fitted, *columns])
-    gram, right = X.T @ X, X.T @ present.residual
-    x = _Normals(gram, right, fitted.shape[1]).solve(_variance(present, X, gram, right, fitted.shape[1]))
-    ends = np.cumsum([fitted.shape[1], *(c.shape[1] for c in columns)])
-    return [x[a:b] for a, b in pairwise(ends)]
-
-
-def _irregularity(cause: LinearCause, values: Array, angles: Array) -> float:
-    """Share of a curve's variance at the recorded angles that a few waves of any order leave."""
-    left = curve(Accepted(cause, cause.grid[0], values, np.zeros((0, 0))), angles)
-    left = left - np.mean(left)
-    total = float(left @ left)
-    if total == 0.0:
-        return 0.0
-    for _ in range(WAVES):
-        trials = []
-        for order in np.arange(0.25, HIGHEST_WAVE, 0.25):
-            wave = np.column_stack([np.ones(len(angles)), np.cos(order * angles), np.sin(order * angles)])
-            # normal equations: three columns, and a share of a variance needs no digits
-            rest = left - wave @ np.linalg.solve(wave.T @ wave + 1e-9 * len(angles) * np.eye(3), wave.T @ left)
-            trials.append((float(rest @ rest), order, rest))
-        left = min(trials, key=lambda t: t[0])[2]
-    return float(left @ left) / total
-
-
-LEAST_OVERLAP = np.deg2rad(120.0)
-ALIKE = 0.75
-
-
-def likenesses(accepted: Sequence[Accepted], angles: Sequence[Array]) -> tuple[Likeness, ...]:
-    """For each curve the earlier one that it resembles most, turned and maybe reversed; slow waves do not count.
-
-    Parameters
-    ----------
-    angles : recorded angles of the joint of each curve, rad: a curve is compared only where it was measured.
-    """
-    steps = 720
-    grid = 2.0 * np.pi * np.arange(steps) / steps
-    curves, known = [], []
-    for item, q in zip(accepted, angles, strict=True):
-        seen = np.zeros(steps, dtype=bool)
-        at = np.round((q % (2.0 * np.pi)) / (2.0 * np.pi) * steps).astype(int)
-        for shift in range(-4, 5):
-            seen[(at + shift) % steps] = True
-        y = curve(item, grid)
-        slow = np.column_stack([np.ones(steps), *(f(m * grid) for m in (1, 2) for f in (np.cos, np.sin))])
-        y = y - slow @ np.linalg.lstsq(slow[seen], y[seen], rcond=1e-6)[0]
-        curves.append(y)
-        known.append(seen)
-    found = []
-    for j in range(1, len(curves)):
-        best: Likeness | None = None
-        for i in range(j):
-            for sense in (1, -1):
-                # curve j at q against sense * curve i at sense * q + shift
-                index = (sense * np.arange(steps)) % steps
-                for shift in range(steps):
-                    there = (index + shift) % steps
-                    both = known[j] & known[i][there]
-                    overlap = float(both.sum()) * 2.0 * np.pi / steps
-                    if overlap < LEAST_OVERLAP:
-                        continue
-                    a, b = curves[j][both], sense * curves[i][there][both]
-                    r = float(a @ b) / max(float(np.sqrt((a @ a) * (b @ b))), 1e-300)
-                    if r > ALIKE and (best is None or r > best.correlation):
-                        best = Likeness(
-                            accepted[j].cause.where,
-                            accepted[i].cause.where,
-                            sense,
-                            shift * 2.0 * np.pi / steps,
-                            r,
-                            overlap,
-                        )
-        if best is not None:
-            found.append(best)
-    return tuple(found)

@@ -4,10 +4,8 @@ What the curves of single joints say of each other starts it; turns then follow 
 steps. Joints that differ keep a curve of what they differ by, whose size the kept-out poses choose.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -23,47 +21,12 @@ TURNS, TABLE = 240, 1441
 """Turns that are tried, and points of the curve's table."""
 ELSEWHERE = np.deg2rad(8.0)
 """Turns farther apart than this are different answers."""
-BEYOND_DOUBT = 1.5
-"""Factor by which the best turn must explain more than any other."""
+SEATS = 4
+"""Turns of a further joint that are tried on kept-out poses."""
 STEP = 1e-4
 """rad, over which a curve is differentiated."""
 LARGEST_TURN = 0.05
 """rad: largest step of a turn; the finest waves of a curve are a few times as long."""
-
-
-@dataclass(frozen=True)
-class Likeness:
-    """A joint whose curve is that of another: `joint(q) = sense * other(sense * q + shift)`.
-
-    Attributes
-    ----------
-    joint, other : a joint and an earlier one that has the same curve. shift : rad.
-    sense : -1 for a part mounted the other way round.
-    correlation : of the two curves where both are known. overlap : rad.
-    """
-
-    joint: str
-    other: str
-    sense: int
-    shift: float
-    correlation: float
-    overlap: float
-
-
-def pattern(joints: Sequence[Joint], likenesses: Sequence[Likeness]) -> tuple[Placed, ...]:
-    """The largest group of joints (in their order) whose curves are alike, the first of them as reference."""
-    groups: list[dict[str, Placed]] = []
-    by_name = {joint.where: joint for joint in joints}
-    for like in likenesses:
-        group = next((g for g in groups if like.other in g), None)
-        if group is None:
-            group = {like.other: Placed(by_name[like.other])}
-            groups.append(group)
-        other = group[like.other]
-        # sense (other.sense c(other.sense (sense q + shift) + other.shift))
-        shift = float((other.sense * like.shift + other.shift) % (2.0 * np.pi))
-        group[like.joint] = Placed(by_name[like.joint], like.sense * other.sense, shift)
-    return tuple(max(groups, key=len).values()) if groups else ()
 
 
 def refined(
@@ -95,7 +58,7 @@ def refined(
     return placed
 
 
-def joined(
+def seats(
     present: Fit,
     at: Tangents,
     cause: RobotCause,
@@ -103,14 +66,15 @@ def joined(
     common: Array,
     others: Sequence[Array],
     solve: Callable[[Fit, Sequence[Array]], list[Array]],
-) -> Placed | None:
-    """How the curve that other joints share sits in one more joint: the turn and sense that explain most there, if no
-    other explains nearly as much.
+) -> tuple[Placed, ...]:
+    """How the curve that other joints share may sit in one more joint: the turns and senses that explain most there.
 
     Parameters
     ----------
     cause, common : the shared curve and its scaled columns. others : scaled columns of all other curves but the
         joint's own.
+
+    Weakness: none of them need be right; poses kept out have to choose.
     """
     columns = [common, *others]
     values = solve(present, columns)
@@ -131,14 +95,18 @@ def joined(
             along = np.clip(left @ trial, 0.0, None)
             gains.append(along**2 / np.maximum(np.sum(trial**2, axis=0), 1e-300))
     gain = np.concatenate(gains)
-    best = int(np.argmax(gain))
-    away = np.abs((turns - turns[best % TURNS] + np.pi) % (2.0 * np.pi) - np.pi) > ELSEWHERE
-    rivals = np.concatenate([away, away])
-    rivals[:TURNS] |= best >= TURNS
-    rivals[TURNS:] |= best < TURNS
-    if gain[best] < BEYOND_DOUBT * np.max(gain[rivals]):
-        return None
-    return Placed(joint, 1 if best < TURNS else -1, float(turns[best % TURNS]))
+    found: list[Placed] = []
+    for k in np.argsort(-gain):
+        seat = Placed(joint, 1 if k < TURNS else -1, float(turns[k % TURNS]))
+        if all(seat.sense != other.sense or _apart(seat, other) > ELSEWHERE for other in found):
+            found.append(seat)
+        if len(found) == SEATS:
+            break
+    return tuple(found)
+
+
+def _apart(one: Placed, other: Placed) -> float:
+    return float(np.abs((one.shift - other.shift + np.pi) % (2.0 * np.pi) - np.pi))
 
 
 def _slope(

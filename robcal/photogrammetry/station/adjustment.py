@@ -19,7 +19,7 @@ from robcal.estimation.schur import Factor, Normals, SingularSystem, station_cof
 from robcal.estimation.summary import SolveSummary, TerminationSettings
 from robcal.photogrammetry.core.camera import INTRINSIC_NAMES, Camera, project_with_jacobians
 from robcal.photogrammetry.core.eccentricity import effective_point
-from robcal.photogrammetry.station.network import MarkTable, StationDesign, Unknowns
+from robcal.photogrammetry.station.network import MarkTable, Prior, StationDesign, Unknowns
 from robcal.transforms import Array, invert, retract
 
 if TYPE_CHECKING:
@@ -103,23 +103,9 @@ def linearise(marks: MarkTable, x: Unknowns, cameras: tuple[Camera, ...], noise:
         value, d_point[rows], by_numbers = project_with_jacobians(camera.with_vector(x.interior[c]), seen[rows])
         d_in[rows] = (by_numbers.reshape(-1, 9) @ basis[c]).reshape(-1, 2, 9)
         r[rows] = marks.xy[rows] - value
-    blocks = Blocks(*(np.empty(shape) for shape in ((m, 2), (m, 2, 6), (m, 2, 9), (m, 2, 3), (m, 2, 6))))
-    differentiate(W, r, d_point, d_in, np.ascontiguousarray(R), p_camera, p_body, blocks)
-    return Linearisation(*blocks, W)
-
-
-@dataclass(frozen=True)
-class Prior:
-    """Weighted observations of unknowns.
-
-    ``interior`` (c, 9) start numbers with ``interior_sigma`` (c, 9) of the adjusted unknowns; ``points`` (t, 3) given
-    coordinates with the inverse covariance ``points_weight`` (3t, 3t), None: coordinates are held.
-    """
-
-    interior: Array
-    interior_sigma: Array
-    points: Array
-    points_weight: Array | None
+    out = Blocks(*(np.empty(shape) for shape in ((m, 2), (m, 2, 6), (m, 2, 9), (m, 2, 3), (m, 2, 6))))
+    differentiate(W, r, d_point, d_in, np.ascontiguousarray(R), p_camera, p_body, out)
+    return Linearisation(*out, W)
 
 
 @dataclass(frozen=True)
@@ -150,7 +136,7 @@ def global_columns(marks: MarkTable, e: int, c: int) -> NDArray[np.int64]:
     )
 
 
-def _prior_terms(x: Unknowns, prior: Prior) -> tuple[Array, Array, float]:
+def prior_terms(x: Unknowns, prior: Prior) -> tuple[Array, Array, float]:
     """Normal matrix, right side and cost of the weighted observations of unknowns."""
     e, c, t = len(x.world_T_exterior), len(x.interior), len(x.points)
     g = 6 * e + 9 * c + 3 * t
@@ -170,26 +156,36 @@ def _prior_terms(x: Unknowns, prior: Prior) -> tuple[Array, Array, float]:
     return N, b, cost
 
 
-def _normal(lin: Linearisation, marks: MarkTable, x: Unknowns, prior: Prior, weights: Array) -> Normals:
+def without_nan(lin: Linearisation) -> Linearisation:
+    """Marks behind their camera, whose weight is zero, with zeros."""
+    if np.isfinite(lin.residual).all():
+        return lin
+    return Linearisation(*(np.where(np.isfinite(a), a, 0.0) for a in vars(lin).values()))
+
+
+def station_normals(lin: Linearisation, marks: MarkTable, x: Unknowns, prior: Prior, weights: Array) -> Normals:
+    """Normal equations of all global unknowns and the poses: weighted marks, weighted observations of unknowns."""
     e, c, p = len(x.world_T_exterior), len(x.interior), len(x.world_T_body)
     g = 6 * e + 9 * c + 3 * len(x.points)
     from robcal.photogrammetry.station.adjustment_loops import Sums, add_marks  # compiled
 
     sums = Sums(np.zeros((g, g)), np.zeros(g), np.zeros((g, p, 6)), np.zeros((p, 6, 6)), np.zeros((p, 6)))
-    add_marks(_blocks(lin), _places(marks, e, c), weights, sums)
-    N, b, _ = _prior_terms(x, prior)
+    add_marks(mark_blocks(lin), mark_places(marks, e, c), weights, sums)
+    N, b, _ = prior_terms(x, prior)
     N += np.tril(sums.matrix) + np.tril(sums.matrix, -1).T
     V = sums.pose_matrix * (1.0 + _POSE_DAMPING * np.eye(6))
     return Normals(N, sums.coupling.transpose(1, 0, 2), V, b + sums.right, sums.pose_right)
 
 
-def _blocks(lin: "Linearisation | StationDesign") -> "Blocks":
+def mark_blocks(lin: "Linearisation | StationDesign") -> "Blocks":
+    """Residuals and derivatives as the compiled loops take them."""
     from robcal.photogrammetry.station.adjustment_loops import Blocks
 
     return Blocks(lin.residual, lin.by_exterior, lin.by_interior, lin.by_point, lin.by_pose)
 
 
-def _places(marks: MarkTable, e: int, c: int) -> "Places":
+def mark_places(marks: MarkTable, e: int, c: int) -> "Places":
+    """Rows of the unknowns of each mark as the compiled loops take them."""
     from robcal.photogrammetry.station.adjustment_loops import Places
 
     return Places(marks.exterior, marks.camera, marks.target, marks.pose, e, c)
@@ -218,7 +214,8 @@ def unknown_names(cameras: tuple[str, ...], exterior: list[str], ids: NDArray[np
     return names + [f"target {i}.{k}" for i in ids for k in "xyz"]
 
 
-def _apply(x: Unknowns, global_step: Array, pose_step: Array, basis: Array) -> Unknowns:
+def moved_unknowns(x: Unknowns, global_step: Array, pose_step: Array, basis: Array) -> Unknowns:
+    """The unknowns after steps of the global ones (6e + 9c + 3t,) and of the poses (p, 6)."""
     e, c = len(x.world_T_exterior), len(x.interior)
     exterior = global_step[: 6 * e].reshape(e, 6)
     interior = np.einsum("cij,cj->ci", basis, global_step[6 * e : 6 * e + 9 * c].reshape(c, 9))
@@ -230,12 +227,13 @@ def _apply(x: Unknowns, global_step: Array, pose_step: Array, basis: Array) -> U
     )
 
 
-def _weights(residual: Array, limit: float | None) -> Array:
+def mark_weights(residual: Array, limit: float | None) -> Array:
     """(m,) weights of whitened residuals (m, 2): Huber's on their lengths, or one."""
     return np.ones(len(residual)) if limit is None else huber_weights(np.linalg.norm(residual, axis=1), limit)
 
 
-def _cost(residual: Array, limit: float | None) -> float:
+def mark_cost(residual: Array, limit: float | None) -> float:
+    """Sum of squares of whitened residuals (m, 2), or of Huber's costs; infinite for a mark behind its camera."""
     length = np.linalg.norm(residual, axis=1)
     if not np.isfinite(length).all():
         return np.inf
@@ -278,14 +276,12 @@ def adjust_station(  # noqa: PLR0913 - options by keyword
 
     def at(x: Unknowns) -> _At:
         lin = linearise(marks, x, cameras, noise)
-        return _At(x, lin, 0.5 * (_cost(lin.residual, huber) + _prior_terms(x, prior)[2]))
+        return _At(x, lin, 0.5 * (mark_cost(lin.residual, huber) + prior_terms(x, prior)[2]))
 
     def system_at(here: _At) -> tuple[Linearisation, Array, Normals]:
-        weights = _weights(here.lin.residual, huber)
-        clean = here.lin
-        if not np.isfinite(clean.residual).all():
-            clean = Linearisation(*(np.where(np.isfinite(a), a, 0.0) for a in vars(here.lin).values()))
-        return clean, weights, _normal(clean, marks, here.unknowns, prior, weights)
+        weights = mark_weights(here.lin.residual, huber)
+        clean = without_nan(here.lin)
+        return clean, weights, station_normals(clean, marks, here.unknowns, prior, weights)
 
     def local(here: _At) -> Linearised[_At]:
         _, _, system = system_at(here)
@@ -294,7 +290,7 @@ def adjust_station(  # noqa: PLR0913 - options by keyword
         def propose(damping: float) -> tuple[_At, float]:
             step, pose_step = _factor(system, active, names, damping).solve(system.b, system.s)
             saved = 0.5 * float(step @ system.b + np.sum(pose_step * system.s))
-            return at(_apply(here.unknowns, step, pose_step, basis)), saved
+            return at(moved_unknowns(here.unknowns, step, pose_step, basis)), saved
 
         return Linearised(here.half_cost, propose, lambda trial: trial.half_cost)
 
@@ -316,8 +312,8 @@ def adjust_station(  # noqa: PLR0913 - options by keyword
         factor.station_inverse,
         factor.station_response,
     )
-    mark_cost = float(np.sum(clean.residual**2))
-    return Adjusted(end.unknowns, design, mark_cost, summary)
+    squares = float(np.sum(clean.residual**2))
+    return Adjusted(end.unknowns, design, squares, summary)
 
 
 def covariance_blocks(design: StationDesign, marks: MarkTable, e: int, c: int) -> tuple[Array, Array]:
@@ -327,8 +323,22 @@ def covariance_blocks(design: StationDesign, marks: MarkTable, e: int, c: int) -
     """
     Q = design.reduced_inverse
     Qpp, Qgp = station_cofactors(design.pose_inverse, design.pose_response, Q)
+    return Qpp, mark_redundancy(design, marks, (e, c), Q, np.ascontiguousarray(Qgp.transpose(1, 0, 2)), Qpp)
+
+
+def mark_redundancy(
+    lin: "Linearisation | StationDesign", marks: MarkTable, counts: tuple[int, int], Q: Array, Qpg: Array, Qpp: Array
+) -> Array:
+    """Redundancy matrices (m, 2, 2) of the whitened marks, ``I - A Q A'``.
+
+    Parameters
+    ----------
+    counts : of exterior and interior orientations.
+    Q, Qpg, Qpp : (g, g), (p, g, 6), (p, 6, 6) cofactors of the global unknowns, of these with the twist of each pose,
+        and of the twists.
+    """
     from robcal.photogrammetry.station.adjustment_loops import covariances  # compiled
 
     covariance = np.empty((len(marks), 2, 2))
-    covariances(_blocks(design), _places(marks, e, c), Q, np.ascontiguousarray(Qgp.transpose(1, 0, 2)), Qpp, covariance)
-    return Qpp, np.eye(2) - covariance
+    covariances(mark_blocks(lin), mark_places(marks, *counts), Q, Qpg, Qpp, covariance)
+    return np.eye(2) - covariance

@@ -150,6 +150,20 @@ class Unknowns:
 
 
 @dataclass(frozen=True)
+class Prior:
+    """Weighted observations of unknowns.
+
+    ``interior`` (c, 9) start numbers with ``interior_sigma`` (c, 9) of the adjusted unknowns; ``points`` (t, 3) given
+    coordinates with the inverse covariance ``points_weight`` (3t, 3t), None: coordinates are held.
+    """
+
+    interior: Array
+    interior_sigma: Array
+    points: Array
+    points_weight: Array | None
+
+
+@dataclass(frozen=True)
 class MarkTable(Columns):
     """All marks of the station in one table.
 
@@ -221,6 +235,7 @@ class StationOrientation:
     redundancy_total, rms_px : totals; rejected : marks left out with reason; evidence : recurring contradictions.
     free_interior : camera -> names of the groups of the interior orientation that were adjusted.
     converged, iterations : of the final adjustment.
+    prior : the weighted observations of interior orientations and body coordinates that it was adjusted with.
     """
 
     names: tuple[str, ...]
@@ -248,6 +263,7 @@ class StationOrientation:
     free_interior: Mapping[str, tuple[str, ...]]
     converged: bool
     iterations: int
+    prior: Prior
 
     @property
     def world_T_camera(self) -> dict[str, Array]:

@@ -262,6 +262,7 @@ def _result(
         free_interior={name: tuple(g for g in GROUPS if g in state.groups[i]) for i, name in enumerate(state.names)},
         converged=adjusted.summary.converged,
         iterations=adjusted.summary.iterations,
+        prior=state.prior,
     )
 
 

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from robcal.photogrammetry.core.bodies import Body, IntArray
 from robcal.photogrammetry.core.camera import Camera
-from robcal.photogrammetry.station.adjustment import Adjusted, Prior, adjust_station, covariance_blocks, unknown_names
-from robcal.photogrammetry.station.network import GROUPS, MarkTable, StationSettings, Unknowns
+from robcal.photogrammetry.station.adjustment import Adjusted, adjust_station, covariance_blocks, unknown_names
+from robcal.photogrammetry.station.network import GROUPS, MarkTable, Prior, StationSettings, Unknowns
 from robcal.transforms import Array
 
 _MEDIAN_CHI2_2 = 2.0 * np.log(2.0)

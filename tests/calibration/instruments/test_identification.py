@@ -1,7 +1,5 @@
 """Several instruments in one identification: truth recovered, priors, shared frames, honest covariances."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

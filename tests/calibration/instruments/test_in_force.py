@@ -1,7 +1,5 @@
 """Terms of a robot that two instruments watch: those in force pay over folds, in which everything is fitted anew."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

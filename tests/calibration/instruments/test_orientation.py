@@ -1,7 +1,5 @@
 """The orientation of a sensor in the hand: held as certified, unless its points tell it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Bundle adjustment against truth: derivatives, uncertainty, datum, gross errors, what cannot be determined."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """COLMAP at the edge: pixel convention, export and back."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Inner constraints and the choice of a datum."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

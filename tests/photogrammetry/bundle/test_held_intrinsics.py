@@ -1,7 +1,5 @@
 """Which intrinsics are held together where images do not determine them, and what may not be held."""
 
-from __future__ import annotations
-
 import pytest
 
 from robcal.errors import NotIdentifiable

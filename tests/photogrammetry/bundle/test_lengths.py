@@ -1,7 +1,5 @@
 """Scale from bars, contradictions, check lengths."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

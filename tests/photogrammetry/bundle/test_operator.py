@@ -1,7 +1,5 @@
 """A finished network as an operator: projection, tests of effects that were left out."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

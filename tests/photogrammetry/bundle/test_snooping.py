@@ -1,7 +1,5 @@
 """Reliability of marks against dense algebra; which marks the test takes out; variance factors."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Approximate networks and single resections from identified points."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

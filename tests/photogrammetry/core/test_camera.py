@@ -1,7 +1,5 @@
 """Laws of the camera model: agreement with OpenCV, round trips, derivatives against differences."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

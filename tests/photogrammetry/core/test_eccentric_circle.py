@@ -1,7 +1,5 @@
 """Centre of the image of a circle against the centroid of its outline as a polygon."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

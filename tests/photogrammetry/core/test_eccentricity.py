@@ -1,7 +1,5 @@
 """Where the centre of a dot's image lies: against brute force with polygons; normals from the shape of a body."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

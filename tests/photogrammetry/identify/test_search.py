@@ -1,8 +1,6 @@
 """Search by triples of dots: the numbering of an irregular body, refusals with their reason, ambiguity of symmetric
 ones."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Which points and poses the distances to other targets condemn, and under which name."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

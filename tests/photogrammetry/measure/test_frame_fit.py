@@ -1,7 +1,5 @@
 """Frames fitted onto points: exact without noise, covariances that cover the scatter, common parts."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from robcal.photogrammetry.core.bodies import Body

@@ -1,7 +1,5 @@
 """What recurs in the lengths of a body: shifted and swapped targets, a common scale, and nothing where nothing is."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Cleaning of a station: which contradiction is found first, what is left out, what is dropped from the lens model."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

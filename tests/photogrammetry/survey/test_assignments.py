@@ -1,7 +1,5 @@
 """The table of a survey: it never changes in place, and provisional ids do not outlive their naming."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np

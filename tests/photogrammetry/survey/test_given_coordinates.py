@@ -1,7 +1,5 @@
 """Given coordinates that a survey refutes."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Images with three identified targets: one of the poses is right, and the other dots show which."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

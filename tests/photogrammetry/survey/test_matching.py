@@ -1,7 +1,5 @@
 """Matching of uncoded dots: gates, ambiguity, new points, sizes."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from robcal.photogrammetry.survey.matching import Geometry, Sightings, is_dot, match_known, seen_diameters

@@ -1,7 +1,5 @@
 """Scale of a survey against everything else that has a length: factors of a wrong unit are errors, per cents notes."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Surveys from detections: identity of uncoded dots, frame, scale, names, bad images; both engines."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 

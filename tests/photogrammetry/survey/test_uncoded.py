@@ -1,7 +1,5 @@
 """A body without any code, nominal coordinates given: identified from the arrangement of its dots."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

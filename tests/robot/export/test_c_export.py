@@ -1,7 +1,5 @@
 """Exported C: compiled with all warnings as errors and compared with the kernel and the compensation in Python."""
 
-from __future__ import annotations
-
 import ctypes
 import shutil
 import subprocess

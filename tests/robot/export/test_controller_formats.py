@@ -1,7 +1,5 @@
 """Controller programs carry the numbers exactly as the controllers read them."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

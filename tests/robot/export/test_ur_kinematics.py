@@ -1,7 +1,5 @@
 """A calibrated robot as Universal Robots' own calibration says the same as its model."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import yaml
