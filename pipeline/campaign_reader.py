@@ -26,7 +26,14 @@ from robcal.files.images import list_images
 from robcal.files.joint_logs import is_joint_log, log_of_robot, read_controller_log
 from robcal.files.laser_sensor import read_sensor, sensed_points
 from robcal.files.line_cameras import measured_lights, read_line_cameras
-from robcal.files.measurement_tables import MeasuredTable, check_marks, marks_of, measurements_of, without_frozen
+from robcal.files.measurement_tables import (
+    MeasuredTable,
+    check_marks,
+    marks_of,
+    measurements_of,
+    unmeasured,
+    without_frozen,
+)
 from robcal.files.poses_table import Poses, check_rows, poses_of
 from robcal.files.reseau_file import list_tiled, read_reseau
 from robcal.files.robot_import import read_any_robot
@@ -180,6 +187,10 @@ class _Reader:
             poses = poses_from_images(self.path, cameras)
         measurements = self._tables(entry.measurements, robot, poses, bodies)
         instruments = self._part(partial(self._instruments, measurements, robot, poses, bodies)) or {}
+        sources = [measurements, *(i.tables for i in instruments.values())]
+        if poses is not None and None not in sources:  # a station sees poses in images
+            tables = {id(t): t for some in sources for t in some or ()}
+            self.warnings.extend(unmeasured(list(tables.values()), self.pose_names))
         if poses is not None and not self.faults:
             poses, measurements, instruments = self._at_own_angles(poses, measurements, instruments)
         return Campaign(
