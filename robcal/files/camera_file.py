@@ -1,7 +1,7 @@
 """Camera files (format robcal/camera-1): interior orientation and, optionally, where the camera stands."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -155,7 +155,8 @@ def _splined(entry: CameraEntry, file: str) -> SplinedCamera:
             f"{file}: dx_px and dy_px of 'spline' need as many rows and columns as one another, {LEAST_NODES} or more"
         )
     numbers = [getattr(entry, name) for name in INTRINSIC_NAMES]
-    return SplinedCamera(entry.width, entry.height, *numbers, nodes=np.stack([np.array(dx), np.array(dy)], axis=-1))
+    nodes = np.stack([np.array(dx, dtype=float), np.array(dy, dtype=float)], axis=-1)
+    return replace(SplinedCamera(entry.width, entry.height, *numbers), nodes=nodes)
 
 
 def _check(camera: Camera, where: Mapping[str, str]) -> None:

@@ -5,9 +5,10 @@ product with the residuals of the other half is normal with known variance. A le
 halves agree, and its splines are those of all images.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import sparse, stats
 from scipy.sparse.linalg import splu
 
@@ -54,7 +55,7 @@ class _Rows:
     A: sparse.csr_matrix
     r: Array
     w: Array
-    half: Array
+    half: NDArray[np.bool_]
 
 
 def lens_field(network: CameraNetwork) -> LensField | None:
@@ -101,7 +102,7 @@ def with_field(network: CameraNetwork, field: LensField) -> SplinedCamera:
         if c.nodes.shape != nodes.shape:
             return c
         nodes = c.nodes + nodes
-    return SplinedCamera(c.width, c.height, *c.vector.tolist(), nodes=nodes)
+    return replace(SplinedCamera(c.width, c.height, *c.vector.tolist()), nodes=nodes)
 
 
 def _across(rows: _Rows, shape: tuple[int, int], smoothing: float, variance: float) -> tuple[float, float]:
@@ -117,7 +118,7 @@ def _across(rows: _Rows, shape: tuple[int, int], smoothing: float, variance: flo
     return z / np.sqrt(2.0), 1.0 - after / max(before, 1e-300)
 
 
-def _fit(rows: _Rows, chosen: Array, shape: tuple[int, int], smoothing: float) -> Array:
+def _fit(rows: _Rows, chosen: NDArray[np.bool_], shape: tuple[int, int], smoothing: float) -> Array:
     """Control points (n, 2) from the chosen rows."""
     A, w = rows.A[chosen], sparse.diags(rows.w[chosen] / rows.w.mean())
     N = (A.T @ w @ A + smoothing * _roughness(shape)).tocsc()
