@@ -10,7 +10,7 @@ from pydantic import BeforeValidator, Field
 
 from robcal.errors import InvalidInput
 from robcal.files.camera_import import foreign_camera, split_choice
-from robcal.files.robot_file import Placement, placement_data
+from robcal.files.placement import Placement, placement_data
 from robcal.files.schemas import Entry, Number, Positive, read_entry, shown
 from robcal.files.storage import write_text
 from robcal.files.yaml_io import FlowMapping, yaml_text
