@@ -14,7 +14,7 @@ from robcal.errors import InvalidInput
 from robcal.files.frame_tables import NEARLY_LOCKED
 from robcal.files.measurement_tables import MeasuredTable
 from robcal.files.schemas import proposal
-from robcal.robot.chain import chain_of, forward
+from robcal.robot.hexapod import nominal_frames
 from robcal.robot.kernel import Kernel
 
 MOST_NAMED = 5
@@ -82,7 +82,7 @@ def _ways(campaign: Campaign, table: MeasuredTable) -> list[str]:
         return []
     if table.pose.max() >= len(campaign.poses) or not campaign.poses.q.shape[1]:
         return []
-    places = forward(chain_of(campaign.robot), campaign.poses.q)[table.pose, :3, 3]
+    places = nominal_frames(campaign.robot, campaign.poses.q)[table.pose, :3, 3]
     measured = table.values[:, :3, 3] if table.kind == "frames" else table.values.reshape(len(table), -1)
     way, nominal = float(np.std(measured, axis=0).max()), float(np.std(places, axis=0).max())
     if nominal < 1e-3 or WAYS[0] < way / nominal < WAYS[1]:

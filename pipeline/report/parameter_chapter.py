@@ -82,8 +82,8 @@ def _parameters(calibrated: Any) -> Table:
     return table(
         ["Parameter", "Value", "Sigma", "Unit", "Value / sigma", "Significant"],
         rows,
-        "Elastic parameters in degrees per kN m of static moment. "
-        "Base and tool are given as frames below, their deviations are folded in.",
+        ("" if model.is_hexapod else "Elastic parameters in degrees per kN m of static moment. ")
+        + "Base and tool are given as frames below, their deviations are folded in.",
         text=(0, 3, 5),
         shown=80,
     )
