@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from pipeline.report import projection_map
 from pipeline.report.blocks import Block, Chapter, Figure, Table, Text, table
 from pipeline.report.material import Material
 from pipeline.report.style import ACCENT, AFTER, BEFORE, CATEGORIES, GREEN, GREY, label, number, rounded, scene, trace
@@ -47,6 +48,7 @@ def _survey(name: str, survey: SurveyResult) -> list[Block]:
     blocks += _lengths([*n.check_lengths, *n.scale_bars])
     interior = np.sqrt(np.clip(np.diag(n.intrinsics_covariance), 0, None))
     blocks.append(_interior({f"survey of {name}": (n.camera, interior)}))
+    blocks += projection_map.of_survey(name, n)
     if n.correlations:
         pairs = [[c.first, c.second, f"{c.value:+.3f}"] for c in sorted(n.correlations, key=lambda c: -abs(c.value))]
         blocks.append(
@@ -119,6 +121,7 @@ def _station(station: StationOrientation) -> list[Block]:
         for name, camera in zip(station.names, station.cameras, strict=True)
     }
     blocks.append(_interior(sigmas))
+    blocks += projection_map.of_station(station)
     return blocks
 
 
