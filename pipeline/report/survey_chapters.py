@@ -13,6 +13,9 @@ from robcal.photogrammetry.station.network import StationOrientation
 from robcal.photogrammetry.survey.types import SurveyResult
 from robcal.transforms import Array, invert
 
+ASKED = 35
+"""Lengths that VDI/VDE 2634 part 1 asks for: seven lines with five each."""
+
 
 def survey_chapter(material: Material) -> Chapter:
     """Numbers of every surveyed body and of the station's cameras."""
@@ -83,6 +86,8 @@ def _lengths(lengths: list[LengthResult]) -> list[Block]:
         if checks
         else "There are no check lengths: give some to have the scale verified after VDI/VDE 2634-1."
     )
+    if checks and len(checks) < ASKED:
+        word += f" The guideline asks for seven lines of five lengths ({ASKED}): E is told by these alone."
     return [
         table(
             ["Length", "Targets", "Known (mm)", "Error (mm)", "Sigma (mm)", "Error / sigma"],
