@@ -33,7 +33,7 @@ def work(context: Context) -> Outcome:
     """Diagnose the images, then the identified robot; verification poses only measure the gain."""
     campaign, run = context.campaign, context.run
     images = findings_of(campaign, run)
-    if campaign.robot is None or campaign.poses is None:
+    if campaign.robot is None or campaign.poses is None or campaign.robot.is_hexapod:
         content = with_images(None, images.findings, images.scans, images.noise)
         write_json(run.diagnosis, content)
         reported = [str(finding.statement) for finding in images.findings] or [str(content["statement"])]
@@ -135,7 +135,9 @@ def _result(diagnosis: Diagnosis) -> dict[str, Any]:
 STAGE = Stage(
     name=NAME,
     applies=lambda campaign: (
-        campaign.entry.diagnosis.enabled and (campaign.measures_robot or campaign.entry.hand_eye is None)
+        campaign.entry.diagnosis.enabled
+        and (campaign.measures_robot or campaign.entry.hand_eye is None)
+        and not (campaign.robot is not None and campaign.robot.is_hexapod and campaign.entry.station is None)
     ),
     work=work,
     inputs=no_files,
