@@ -77,7 +77,7 @@ def work(context: Context) -> Outcome:
         found = identify_robot(robot, poses, recording, options_of(campaign, recording.stated))
     except InvalidInput as error:
         raise located(error, str(poses.path)) from None
-    alone = found.robot
+    alone: CalibratedRobot = found.robot
     if not campaign.entry.diagnosis.enabled:
         measured = Measured(body_for_robot(campaign, run), run.find(POINTS), run.find(ORIENTATION))
         alone = undiagnosed(found, poses, measured)
