@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from pipeline.report import projection_map
 from pipeline.report.blocks import Block, Chapter, Figure, Table, Text, table
 from pipeline.report.material import Material
 from pipeline.report.style import ACCENT, AFTER, BEFORE, CATEGORIES, GREEN, GREY, label, number, rounded, scene, trace
@@ -11,6 +12,9 @@ from robcal.photogrammetry.core.network import CameraNetwork, LengthResult
 from robcal.photogrammetry.station.network import StationOrientation
 from robcal.photogrammetry.survey.types import SurveyResult
 from robcal.transforms import Array, invert
+
+ASKED = 35
+"""Lengths that VDI/VDE 2634 part 1 asks for: seven lines with five each."""
 
 
 def survey_chapter(material: Material) -> Chapter:
@@ -47,6 +51,7 @@ def _survey(name: str, survey: SurveyResult) -> list[Block]:
     blocks += _lengths([*n.check_lengths, *n.scale_bars])
     interior = np.sqrt(np.clip(np.diag(n.intrinsics_covariance), 0, None))
     blocks.append(_interior({f"survey of {name}": (n.camera, interior)}))
+    blocks += projection_map.of_survey(name, n)
     if n.correlations:
         pairs = [[c.first, c.second, f"{c.value:+.3f}"] for c in sorted(n.correlations, key=lambda c: -abs(c.value))]
         blocks.append(
@@ -81,6 +86,8 @@ def _lengths(lengths: list[LengthResult]) -> list[Block]:
         if checks
         else "There are no check lengths: give some to have the scale verified after VDI/VDE 2634-1."
     )
+    if checks and len(checks) < ASKED:
+        word += f" The guideline asks for seven lines of five lengths ({ASKED}): E is told by these alone."
     return [
         table(
             ["Length", "Targets", "Known (mm)", "Error (mm)", "Sigma (mm)", "Error / sigma"],
@@ -119,6 +126,7 @@ def _station(station: StationOrientation) -> list[Block]:
         for name, camera in zip(station.names, station.cameras, strict=True)
     }
     blocks.append(_interior(sigmas))
+    blocks += projection_map.of_station(station)
     return blocks
 
 
