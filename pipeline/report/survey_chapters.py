@@ -208,11 +208,11 @@ def _network(name: str, network: CameraNetwork) -> Figure:
 
 def _station_scene(station: StationOrientation, material: Material) -> Figure:
     centres = station.world_T_body[:, :3, 3]
-    stands = station.world_T_exterior
-    extent = float(np.median(np.linalg.norm(centres - stands[0][:3, 3], axis=1)))
+    world_T_camera = station.world_T_exterior
+    extent = float(np.median(np.linalg.norm(centres - world_T_camera[0][:3, 3], axis=1)))
     data = [
         _lines(
-            _camera_lines(stands[station.exterior_camera == c], 0.06 * extent),
+            _camera_lines(world_T_camera[station.exterior_camera == c], 0.06 * extent),
             f"camera {name}",
             CATEGORIES[c % len(CATEGORIES)],
             4,
@@ -226,7 +226,7 @@ def _station_scene(station: StationOrientation, material: Material) -> Figure:
     names = [material.pose_name(int(p)) for p in station.poses]
     data.append(_dots(centres, names, "measured poses", GREEN, 3, station.poses))
     # the cameras' own upward direction, or the robot's where it is known
-    up = -stands[0][:3, 1]
+    up = -world_T_camera[0][:3, 1]
     if material.calibrated is not None and material.calibrated.model.world_T_base is not None:
         up = np.asarray(material.calibrated.model.world_T_base)[:3, 2]
     return Figure(

@@ -107,7 +107,7 @@ def verification_chapter(material: Material) -> Chapter:
         blocks.append(_pose_table(verification, names, rows))
         blocks += [_iso(verification)] if verification.iso is not None else []
         blocks += _repeated(material)
-        blocks += [_calibration_of_uncertainty(verification, names, rows), Text(_honesty(verification))]
+        blocks += [_calibration_of_uncertainty(verification, names, rows), Text(_calibration_words(verification))]
     return Chapter("verification", "Pose errors before and after", _lead(material), tuple(blocks))
 
 
@@ -332,7 +332,7 @@ def _calibration_of_uncertainty(v: Verification, names: list[str], rows: Rows) -
     )
 
 
-def _honesty(v: Verification) -> str:
+def _calibration_words(v: Verification) -> str:
     inside = f"{percent(v.coverage_95)} of the poses lie inside their 95 % region"
     if v.p_value < 0.01:
         return (
