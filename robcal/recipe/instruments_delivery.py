@@ -136,7 +136,7 @@ def delivered(anew: Anew, told: Sequence[Told], not_told: tuple[str, ...]) -> In
         # the law of a search is linear: what it needed beside the right cause the exact one does not
         needless = [t for t in told if _is_needless(t, again)]
         if not needless:
-            folds = InstrumentFolds(again, anew.log, options)
+            folds = InstrumentFolds(start, again, anew.log, options)
             groups = _groups(told, again)
             weak = contradicted_groups(
                 folds, {k: names for k, names in groups.items() if names and not told[int(k)].by_priors}

@@ -80,7 +80,9 @@ def diagnose_instruments(
         own[name] = diagnose(case.model, case.recording, case.free, case.tied, None, settings or SelectionSettings())
     told = [Told(f, name) for name, d in own.items() for f in d.findings]
     told = _distinct([_compared(t, cases) for t in told])
-    told += [t for n, c in cases.items() if c.recording.hidden and (t := _scale_of(n, c, found, log, options, told))]
+    told += [
+        t for n, c in cases.items() if c.recording.hidden and (t := _scale_of(n, c, model, found, log, options, told))
+    ]
     anew = Anew(model, found, instruments, log, options or IdentifyOptions(), corrections or {}, own)
     return delivered(anew, told, tuple(not_told))
 
@@ -134,6 +136,7 @@ def _lengths_are_believed(options: IdentifyOptions | None) -> bool:
 def _scale_of(
     name: str,
     case: _Case,
+    model: RobotModel,
     found: IdentifiedInstruments,
     log: JointLog,
     options: IdentifyOptions | None,
@@ -143,7 +146,7 @@ def _scale_of(
     known = any(t.instrument == name and t.finding.cause.stage == "wire" for t in told)
     if known or options is None or not _lengths_are_believed(options):
         return None
-    finding = scale_by_lengths(found, name, case.recording, log, options)
+    finding = scale_by_lengths(model, found, name, case.recording, log, options)
     return None if finding is None else Told(finding, name, by_priors=True)
 
 

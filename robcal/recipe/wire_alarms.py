@@ -23,6 +23,7 @@ from robcal.estimation.minimum_norm import solve
 from robcal.physics.cause import DEVIATION, numeric_sigma
 from robcal.physics.measuring import WIRE_SCALE, measuring_causes
 from robcal.robot.kernel_cache import kernel_of
+from robcal.robot.model import RobotModel
 
 USUAL_LENGTH = 2e-4
 """m; deviation of a link that is usual. Less than that is no reason for an alarm."""
@@ -41,12 +42,14 @@ WORDS: Mapping[str, str] = {
 }
 
 
-def wire_alarms(found: IdentifiedInstruments, log: JointLog, options: IdentifyOptions | None = None) -> list[str]:
+def wire_alarms(
+    model: RobotModel, found: IdentifiedInstruments, log: JointLog, options: IdentifyOptions | None = None
+) -> list[str]:
     """A sentence where links are off in a way that wires explain, or that nothing does; empty where all is usual.
 
     Parameters
     ----------
-    options : as for the identification; its priors are what is believed of single parameters.
+    model : the robot that was identified. options : as for the identification; its priors are what is believed of single parameters.
     """
     identified = [p for p in found.placed.values() if p.robot is not None and not p.instrument.loop]
     robot = identified[0].robot if identified else None
@@ -65,7 +68,7 @@ def wire_alarms(found: IdentifiedInstruments, log: JointLog, options: IdentifyOp
             if kind in placed.instrument.wire:
                 continue
             name = f"{placed.instrument.name}.wire.{kind}"
-            linear = linearised(found, log, options, {placed.instrument.name: (kind,)})
+            linear = linearised(model, found, log, options, {placed.instrument.name: (kind,)})
             value, sigma, moved = explained(linear, name, robot, options)
             strength = abs(value) / (sigma * max(robot.sigma0, 1.0))
             if strength > max(SURE, best) and moved:
@@ -80,18 +83,23 @@ def wire_alarms(found: IdentifiedInstruments, log: JointLog, options: IdentifyOp
 
 
 def scale_by_lengths(
-    found: IdentifiedInstruments, name: str, recording: Recording, log: JointLog, options: IdentifyOptions
+    model: RobotModel,
+    found: IdentifiedInstruments,
+    name: str,
+    recording: Recording,
+    log: JointLog,
+    options: IdentifyOptions,
 ) -> Finding | None:
     """A wrong scale of a wire, told by what is believed of the lengths of links; None where it is not certain.
 
     Parameters
     ----------
-    name : of the instrument. recording : its measurements as the diagnosis takes them.
+    model : the robot that was identified. name : of the instrument. recording : its measurements as the diagnosis takes them.
     """
     robot = found.placed[name].robot
     if robot is None:
         return None
-    linear = linearised(found, log, options, {name: ("scale",)})
+    linear = linearised(model, found, log, options, {name: ("scale",)})
     value, sigma, _ = explained(linear, f"{name}.wire.scale", robot, options)
     sigma *= max(robot.sigma0, 1.0)
     if abs(value) < CERTAIN * sigma:
