@@ -23,17 +23,31 @@ def contradictions(entry: CampaignEntry) -> Iterator[Contradiction]:
         yield (("robot",), "a robot needs its joint angles: add 'poses: poses.csv'")
     if not (surveyed or measured or entry.station is not None or entry.hand_eye is not None):
         yield ((), "nothing to work on: give a body a 'survey', or add a 'station', 'measurements' or 'hand_eye'")
-    if entry.model.adjustment == "joint" and (entry.station is None or entry.robot is None or entry.instruments):
-        yield (
-            ("model", "adjustment"),
-            "'adjustment: joint' adjusts a robot with the marks of its own station: it needs 'robot', and a 'station' "
-            "with images or observations as the only instrument; else write 'adjustment: staged'",
-        )
+    if entry.model.adjustment == "joint":
+        yield from _joint(entry)
     yield from _hand_eye(entry)
     carried = entry.station.body if entry.station else None
     for key, place in ((entry.body, ("body",)), (carried, ("station", "body"))):
         if key is not None and key not in entry.bodies:
             yield (place, f"there is no body '{key}' under 'bodies'{proposal(key, list(entry.bodies))}")
+
+
+def _joint(entry: CampaignEntry) -> Iterator[Contradiction]:
+    place: Place = ("model", "adjustment")
+    if entry.station is None or entry.robot is None or entry.instruments or entry.measurements:
+        yield (
+            place,
+            "'adjustment: joint' adjusts a robot with the marks of its own station: it needs 'robot', and a 'station' "
+            "with images or observations as the only instrument; else write 'adjustment: staged'",
+        )
+    known = [key for key in ("world_T_base", "flange_T_tool") if getattr(entry, key) is not None]
+    known += ["model.priors"] if entry.model.priors else []
+    if known:
+        yield (
+            place,
+            f"'adjustment: joint' knows nothing of what {' and '.join(known)} state{'s' * (len(known) == 1)} of the "
+            "robot: leave that out, or write 'adjustment: staged'",
+        )
 
 
 def _hand_eye(entry: CampaignEntry) -> Iterator[Contradiction]:

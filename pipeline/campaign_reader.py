@@ -26,14 +26,21 @@ from robcal.files.images import list_images
 from robcal.files.joint_logs import is_joint_log, log_of_robot, read_controller_log
 from robcal.files.laser_sensor import read_sensor, sensed_points
 from robcal.files.line_cameras import measured_lights, read_line_cameras
-from robcal.files.measurement_tables import MeasuredTable, check_marks, marks_of, measurements_of, without_frozen
+from robcal.files.measurement_tables import (
+    MeasuredTable,
+    check_marks,
+    marks_of,
+    measurements_of,
+    unmeasured,
+    without_frozen,
+)
 from robcal.files.poses_table import Poses, check_rows, poses_of
 from robcal.files.reseau_file import list_tiled, read_reseau
 from robcal.files.robot_import import read_any_robot
 from robcal.files.schemas import parse, parse_leniently, proposal
 from robcal.files.tables import FaultyRows, Table, read_table
 from robcal.files.yaml_io import read_yaml
-from robcal.photogrammetry.core.camera import Camera
+from robcal.photogrammetry.core.adjustable import adjustable
 from robcal.physics.gravity_sag import without_masses
 from robcal.robot.chain import chain_of, forward
 from robcal.robot.model import RobotModel
@@ -180,6 +187,10 @@ class _Reader:
             poses = poses_from_images(self.path, cameras)
         measurements = self._tables(entry.measurements, robot, poses, bodies)
         instruments = self._part(partial(self._instruments, measurements, robot, poses, bodies)) or {}
+        sources = [measurements, *(i.tables for i in instruments.values())]
+        if poses is not None and None not in sources:  # a station sees poses in images
+            tables = {id(t): t for some in sources for t in some or ()}
+            self.warnings.extend(unmeasured(list(tables.values()), self.pose_names))
         if poses is not None and not self.faults:
             poses, measurements, instruments = self._at_own_angles(poses, measurements, instruments)
         return Campaign(
@@ -372,8 +383,7 @@ class _Reader:
             return BodySource(file)
         place = ("bodies", name, "survey")
         source = self._source(use.survey, use.survey.camera, place, f"the survey of '{name}'")
-        self._brown(source, place)
-        return BodySource(file, source, use.survey)
+        return BodySource(file, _adjustable(source), use.survey)
 
     def _source(
         self, entry: SurveyEntry | StationCameraEntry, camera: str | None, place: tuple[str | int, ...], what: str
@@ -423,19 +433,10 @@ class _Reader:
 
     def _camera(self, name: str, use: StationCameraEntry, poses: Poses | None) -> ImageSource:
         source = self._source(use, use.calibration, ("station", "cameras", name), f"camera '{name}'")
-        self._brown(source, ("station", "cameras", name))
+        source = _adjustable(source)
         if use.images is not None:
             source = replace(source, images=images_by_stem(source.images))
         return self._match_poses(source, name, poses)
-
-    def _brown(self, source: ImageSource, place: tuple[str | int, ...]) -> None:
-        """Refuse a lens that a survey or a station cannot adjust."""
-        if source.start is not None and type(source.start.camera) is not Camera:
-            raise self._error(
-                place,
-                f"{source.start_path}: surveys and stations adjust Brown's lens (k1, k2, p1, p2, k3): leave the "
-                "calibration out, the camera is then self-calibrated (other lenses serve a hand-eye calibration)",
-            )
 
     def _match_poses(self, source: ImageSource, camera: str, poses: Poses | None) -> ImageSource:
         if poses is None:
@@ -459,3 +460,10 @@ class _Reader:
             return f"target {target} is in no body of the campaign{remedy}"
 
         table.refuse(strange, told)
+
+
+def _adjustable(source: ImageSource) -> ImageSource:
+    """The source with start values that surveys and stations adjust, whatever the lens."""
+    if source.start is None:
+        return source
+    return replace(source, start=replace(source.start, camera=adjustable(source.start.camera)))

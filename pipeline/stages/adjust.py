@@ -13,7 +13,7 @@ from robcal.errors import RobcalError, located
 from robcal.files.camera_file import CameraFile, write_camera
 from robcal.files.poses_table import Poses
 from robcal.files.robot_file import write_robot
-from robcal.joint_adjustment.adjustment import JointAdjustment
+from robcal.joint_adjustment.result import JointAdjustment
 from robcal.recipe.joint import adjust_robot
 
 NAME = "adjust"

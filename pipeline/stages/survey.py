@@ -16,8 +16,9 @@ from robcal.errors import InvalidInput, RobcalError, located
 from robcal.files.body_file import BodyFile, write_body
 from robcal.files.camera_file import CameraFile, write_camera
 from robcal.photogrammetry.bundle.colmap_engine import export_colmap
+from robcal.photogrammetry.core.adjustable import adjustable_names, plain
 from robcal.photogrammetry.core.bodies import Body
-from robcal.photogrammetry.core.camera import INTRINSIC_NAMES
+from robcal.photogrammetry.core.camera import INTRINSIC_NAMES, Camera
 from robcal.photogrammetry.core.network import Lengths
 from robcal.photogrammetry.survey.given_coordinates import GivenCoordinates, compare_given
 from robcal.photogrammetry.survey.survey import SurveyImage, SurveyResult, survey_body
@@ -161,9 +162,12 @@ def _write(run: Run, name: str, source: BodySource, body: Body, done: SurveyResu
     sigma = np.sqrt(np.clip(np.diag(done.network.intrinsics_covariance), 0, None))
     start = source.survey.start if source.survey is not None else None
     pixel = start.pixel_um if start is not None else None
-    run.colmap(name).mkdir(parents=True, exist_ok=True)
-    export_colmap(done.network, run.colmap(name))
-    camera = CameraFile(done.network.camera, None, pixel, dict(zip(INTRINSIC_NAMES, map(float, sigma), strict=True)))
+    if type(done.network.camera) is Camera:  # COLMAP's model here has Brown's terms
+        run.colmap(name).mkdir(parents=True, exist_ok=True)
+        export_colmap(done.network, run.colmap(name))
+    sigmas = dict(zip(INTRINSIC_NAMES, map(float, sigma), strict=True))
+    own = {n: sigmas[n] for n in adjustable_names(done.network.camera)}
+    camera = CameraFile(plain(done.network.camera), None, pixel, own)
     path = run.camera(f"{NAME}_{name}")
     write_camera(path, camera, f"self-calibrated in the survey of {name}")
     return [run.body(name), path]

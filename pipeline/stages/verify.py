@@ -31,6 +31,7 @@ from robcal.recipe.noise import noise_of
 from robcal.recipe.verdict import robot_facts
 from robcal.recipe.verification import RobotVerification, approach_note, datum_note, verify_robot
 from robcal.robot.model import parameter_unit
+from robcal.transforms import Array
 
 NAME = "verify"
 
@@ -39,7 +40,7 @@ def work(context: Context) -> Outcome:
     """Verify on the kept-out poses, or by folds where there are none; write the calibrated robot."""
     campaign, run = context.campaign, context.run
     robot, poses = require_robot(campaign)
-    identification, delivered = _before(run)
+    identification, delivered, relative = _before(run)
     calibrated = load_calibrated(run)
     diagnosed = run.record("diagnose") is not None
     placed = run.find(artifacts.PLACED) if diagnosed else None
@@ -54,7 +55,7 @@ def work(context: Context) -> Outcome:
             found = telling_verification(instruments, verified)
         else:
             # a diagnosis has verified already what it delivers
-            found = delivered or verify_robot(robot, identification, calibrated, poses, options)
+            found = delivered or verify_robot(robot, identification, calibrated, poses, options, relative=relative)
     except InvalidInput as error:
         raise located(error, str(poses.path)) from None
     write_robot(run.robot, calibrated.model, f"calibrated from campaign {campaign.name}")
@@ -79,6 +80,7 @@ def work(context: Context) -> Outcome:
     doubts = doubtful_coordinates(run)
     noise = noise_of(identification, calibrated, poses)
     facts = robot_facts(identification, calibrated, poses, found.delivered, diagnosis, doubts, wrong)
+    facts = replace(facts, elsewhere=found.elsewhere)
     wanted = campaign.entry.tolerance_mm
     if wanted is not None:
         facts = replace(facts, conformity=conformity(found.delivered.errors["0"], wanted / 1e3, noise.along))
@@ -91,12 +93,13 @@ def work(context: Context) -> Outcome:
     return Outcome(result, outputs, [*notes, *noise.notes])
 
 
-def _before(run: Run) -> tuple[Identification, RobotVerification | None]:
-    """What the robot is verified against, and its verification where a diagnosis has made it already."""
+def _before(run: Run) -> tuple[Identification, RobotVerification | None, Array | None]:
+    """What the robot is verified against, its verification where a diagnosis has made it already, and the covariance of
+    its parameters against frames of the cameras it was adjusted with."""
     adjusted = run.find(artifacts.ADJUSTED)
     if adjusted is not None:  # the frames, too, are those of the cameras as adjusted
-        return adjusted.identification, None
-    return run.load(artifacts.IDENTIFICATION), run.find(artifacts.DELIVERED)
+        return adjusted.identification, None, adjusted.adjustment.relative
+    return run.load(artifacts.IDENTIFICATION), run.find(artifacts.DELIVERED), None
 
 
 def doubtful_coordinates(run: Run) -> list[str]:

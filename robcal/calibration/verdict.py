@@ -48,6 +48,7 @@ class Facts:
     coverage_95 : share of the kept-out poses inside their 95 % region; kept_out : their number.
     disagreeing : results that contradict one another, in words.
     unexplained : the diagnosis finds structure that no cause explains; unnamed : part of the model has no name.
+    elsewhere : kept-out poses were measured from another place or with another tool, in words.
     conformity : errors against the user's tolerance, None where there is none.
     """
 
@@ -66,6 +67,7 @@ class Facts:
     disagreeing: Sequence[str] = field(default=())
     unexplained: bool = False
     unnamed: bool = False
+    elsewhere: str = ""
     conformity: Conformity | None = None
 
 
@@ -180,6 +182,7 @@ def _often(c: Conformity) -> bool:
 
 RULES: tuple[Rule, ...] = (
     Rule("tolerance", "bad", _missed),
+    Rule("elsewhere", "bad", lambda f: f.elsewhere),
     Rule("gain", "bad", _gain),
     Rule("mirrored", "bad", _mirror),
     Rule("agreement", "bad", lambda f: "; ".join(f.disagreeing)),

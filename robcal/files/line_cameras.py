@@ -176,7 +176,7 @@ def measured_lights(table: Table, pose_names: Sequence[str], system: LineCameraS
     InvalidInput : as :func:`lights_of`; a pose that is not in the table of poses.
     """
     table.require(READING)
-    pose, notes = pose_index(table, pose_names)
+    pose, notes = pose_index(table, pose_names), list[str]()
     target = target_ids(table)
     lights, found = lights_of(table, system)
     good = np.asarray(np.isfinite(found.p_world).all(axis=1))

@@ -156,7 +156,7 @@ def measurements_of(
     table.require(needed)
     if not len(table):
         raise InvalidInput(f"{path}: lists no measurements")
-    pose, notes = pose_index(table, pose_names)
+    pose = pose_index(table, pose_names)
     target = target_ids(table) if "target" in needed else np.full(len(table), -1, dtype=np.int64)
     keys = ["pose", *(["target"] if "target" in needed else []), *(["cycle"] if table.has("cycle") else [])]
     table.unique(keys)
@@ -174,9 +174,7 @@ def measurements_of(
     _check_size(table, values)
     covariates = {name: table.numbers(name) for name in ("cycle", "time_s") if table.has(name)}
     angles = six[:, 3:] if kind == "frames" else None
-    measured = MeasuredTable(
-        kind, path, pose, table.rows, target, values, covariance, covariates, tuple(notes), angles, q=q
-    )
+    measured = MeasuredTable(kind, path, pose, table.rows, target, values, covariance, covariates, angles=angles, q=q)
     return _without_empty(measured, pose_names)
 
 
@@ -184,10 +182,10 @@ def _constraints(table: Table, pose_names: Sequence[str]) -> MeasuredTable:
     if not len(table):
         raise InvalidInput(f"{table.path}: lists no constraints")
     number, kinds, values, variance = read_constraints(table)
-    pose, notes = pose_index(table, pose_names)
+    pose = pose_index(table, pose_names)
     none = np.full(len(table), -1, dtype=np.int64)
     return MeasuredTable(
-        "constraints", table.path, pose, table.rows, none, values, variance, {}, tuple(notes), None, kinds, number
+        "constraints", table.path, pose, table.rows, none, values, variance, {}, loops=kinds, loop=number
     )
 
 
@@ -252,8 +250,8 @@ def _kind(table: Table) -> Kind:
     )
 
 
-def pose_index(table: Table, pose_names: Sequence[str]) -> tuple[IntArray, list[str]]:
-    """Rows (m,) of the poses in the table of poses, and a note where some have no measurement."""
+def pose_index(table: Table, pose_names: Sequence[str]) -> IntArray:
+    """Rows (m,) of the poses in the table of poses."""
     place = {name: i for i, name in enumerate(pose_names)}
     cells = table.texts("pose")
     unknown = [cell not in place for cell in cells]
@@ -263,12 +261,17 @@ def pose_index(table: Table, pose_names: Sequence[str]) -> tuple[IntArray, list[
             f"pose '{cells[i]}' is not in the table of poses ({sum(unknown)} such rows): add it there or remove the row"
         ),
     )
-    measured = set(cells)
-    missing = [name for name in pose_names if name not in measured]
-    notes = []
-    if missing:
-        notes.append(f"{len(missing)} poses have no measurement in {table.path.name} ({few(missing)})")
-    return np.array([place[cell] for cell in cells], dtype=np.int64), notes
+    return np.array([place[cell] for cell in cells], dtype=np.int64)
+
+
+def unmeasured(tables: Sequence[MeasuredTable], pose_names: Sequence[str]) -> list[str]:
+    """A note where some poses have no measurement in any of the tables."""
+    if not tables:
+        return []
+    measured = np.unique(np.concatenate([table.pose for table in tables]))
+    missing = np.delete(np.asarray(pose_names, dtype=object), measured)
+    names = " and ".join(dict.fromkeys(table.path.name for table in tables))
+    return [f"{len(missing)} poses have no measurement in {names} ({few(missing.tolist())})"] if len(missing) else []
 
 
 def few(names: Sequence[str]) -> str:

@@ -5,7 +5,7 @@ Sources: variance components by sums of squares over redundancies: Foerstner (19
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy import special, stats
@@ -15,11 +15,11 @@ from robcal.calibration.joint_log import JointLog
 from robcal.calibration.measurements import Rows
 from robcal.calibration.outliers import suspicious
 from robcal.estimation.levenberg import levenberg
-from robcal.estimation.summary import SolveSummary, TerminationSettings
+from robcal.estimation.summary import TerminationSettings
 from robcal.joint_adjustment.assembly import assemble
-from robcal.joint_adjustment.cofactors import Cofactors, cofactors
+from robcal.joint_adjustment.cofactors import Cofactors
 from robcal.joint_adjustment.problem import JointAt, JointProblem, JointState, Limits
-from robcal.photogrammetry.station.adjustment import interior_basis
+from robcal.joint_adjustment.result import JointAdjustment, Solution, result_of
 from robcal.photogrammetry.station.cleaning import mark_statistic
 from robcal.photogrammetry.station.network import RejectedMark, StationMarks, StationOrientation
 from robcal.transforms import Array
@@ -37,45 +37,6 @@ LEAST_SIGMA = 1e-9
 SETTLED = 0.02
 """Relative change of all variance components below which they stay."""
 _MEDIAN_2, _MEDIAN_6 = float(special.chdtri(2, 0.5)), float(special.chdtri(6, 0.5))
-
-
-@dataclass(frozen=True)
-class JointAdjustment:
-    """Station, body and robot adjusted together.
-
-    Attributes
-    ----------
-    robot : with the covariance that cameras and body have a part in; its joints scatter as estimated.
-    orientation : the station with its cameras, covariance, body and noise as adjusted now. The linearised model inside
-        is still that of the station by itself.
-    joint_sigma : (N,) scatter of the joints, rad or m: what they do not repeat and what the model lacks.
-    loose : rows of the joint log of poses found not to stand where the robot's joints say.
-    rejected : marks left out beside those that the station left out.
-    marks : number of marks used; poses : of poses that hang on the robot.
-    sigma0 : root of the sum of squares over the redundancy; the variance components make it one.
-    """
-
-    robot: CalibratedRobot
-    orientation: StationOrientation = field(repr=False)
-    joint_sigma: Array
-    loose: tuple[int, ...]
-    rejected: tuple[RejectedMark, ...]
-    marks: int
-    poses: int
-    sigma0: float
-    summary: SolveSummary
-    seconds: float
-
-
-@dataclass(frozen=True)
-class _Solution:
-    problem: JointProblem
-    here: JointAt
-    limits: Limits | None
-    summary: SolveSummary
-
-    def cofactors(self) -> Cofactors:
-        return cofactors(self.problem, self.here, self.limits)
 
 
 def adjust_jointly(
@@ -104,16 +65,16 @@ def adjust_jointly(
     problem, start, rows = assemble(orientation, marks, robot, log, tied)
     solution = _settled(_solve(problem, problem.at(start, ROBUST), ROBUST), robust=True)
     solution, rejected, loose = _tested(solution, orientation, rows)
-    return _result(solution, robot, orientation, rejected, loose, time.perf_counter() - clock)
+    return result_of(solution, robot, orientation, rejected, loose, time.perf_counter() - clock)
 
 
-def _solve(problem: JointProblem, start: JointAt, limits: Limits | None, steps: int = STEPS) -> _Solution:
+def _solve(problem: JointProblem, start: JointAt, limits: Limits | None, steps: int = STEPS) -> Solution:
     settings = TerminationSettings(steps, 12, 0.0, NEGLIGIBLE)
     here, summary = levenberg(lambda at: problem.local(at, limits), start, settings)
-    return _Solution(problem, here, limits, summary)
+    return Solution(problem, here, limits, summary)
 
 
-def _settled(solution: _Solution, *, robust: bool, rounds: int = 10) -> _Solution:
+def _settled(solution: Solution, *, robust: bool, rounds: int = 10) -> Solution:
     """Solved again with the variance components that its residuals show, until these stay."""
     limits = solution.limits
     for _ in range(rounds):
@@ -126,7 +87,7 @@ def _settled(solution: _Solution, *, robust: bool, rounds: int = 10) -> _Solutio
     return _solve(solution.problem, solution.here, limits)
 
 
-def _variance_factors(solution: _Solution, found: Cofactors, *, robust: bool) -> tuple[Array, float]:
+def _variance_factors(solution: Solution, found: Cofactors, *, robust: bool) -> tuple[Array, float]:
     """Factors on the standard deviations of each camera's marks (c,) and of the joints' scatter."""
     problem, here = solution.problem, solution.here
     square = np.sum(here.lin.residual**2, axis=1)
@@ -166,8 +127,8 @@ def _rescaled(
 
 
 def _tested(
-    solution: _Solution, orientation: StationOrientation, rows: Rows
-) -> tuple[_Solution, list[RejectedMark], list[int]]:
+    solution: Solution, orientation: StationOrientation, rows: Rows
+) -> tuple[Solution, list[RejectedMark], list[int]]:
     """Least squares without marks that contradict all others, and with poses free that do."""
     rejected: list[RejectedMark] = []
     loose: list[int] = []
@@ -196,7 +157,7 @@ def _tested(
     return _settled(solution, robust=False), rejected, loose
 
 
-def _worst_pose(solution: _Solution, found: Cofactors) -> int | None:
+def _worst_pose(solution: Solution, found: Cofactors) -> int | None:
     """The pose that stands out most from how the joints scatter; None if none does."""
     problem = solution.problem
     u = solution.here.state.scatter
@@ -207,7 +168,7 @@ def _worst_pose(solution: _Solution, found: Cofactors) -> int | None:
     return max(some, key=lambda i: float(square[i])) if some else None
 
 
-def _worst_marks(solution: _Solution, found: Cofactors, limit: float) -> np.ndarray:
+def _worst_marks(solution: Solution, found: Cofactors, limit: float) -> np.ndarray:
     """(m,) the worst mark of each image, where it is beyond the limit."""
     marks = solution.problem.marks
     T2 = mark_statistic(solution.here.lin.residual, found.marks)
@@ -222,80 +183,3 @@ def _freed(problem: JointProblem, state: JointState, pose: int) -> tuple[JointPr
     tied, reference, scatter = problem.tied.copy(), problem.reference.copy(), state.scatter.copy()
     tied[pose], reference[pose], scatter[pose] = False, state.station.world_T_body[pose], 0.0
     return replace(problem, tied=tied, reference=reference), replace(state, scatter=scatter)
-
-
-def _result(
-    solution: _Solution,
-    robot: CalibratedRobot,
-    orientation: StationOrientation,
-    rejected: list[RejectedMark],
-    loose: list[int],
-    seconds: float,
-) -> JointAdjustment:
-    problem, here = solution.problem, solution.here
-    found = solution.cofactors()
-    state, p = here.state, len(problem.columns)
-    values = {n: float(v) for n, v in zip(problem.kernel.names, state.robot.theta, strict=True)}
-    model = replace(
-        robot.model.with_parameters(values),
-        world_T_base=state.robot.world_T_base,
-        flange_T_tool=state.robot.flange_T_tool,
-    )
-    redundancy = float(np.einsum("mii->", found.marks)) + float(
-        np.sum(6 - np.einsum("nii->n", found.scatter)[problem.tied])
-    )
-    square = float(np.sum(here.lin.residual**2)) + float(np.sum(state.scatter[problem.tied] ** 2))
-    adjusted = replace(
-        robot,
-        model=model,
-        covariance=found.shared[-p:, -p:],
-        covariance_scale=1.0,
-        joint_sigma=problem.joint_sigma.tolist(),
-    )
-    return JointAdjustment(
-        robot=adjusted,
-        orientation=_oriented(problem, state, found, orientation, rejected),
-        joint_sigma=problem.joint_sigma,
-        loose=tuple(sorted(loose)),
-        rejected=tuple(rejected),
-        marks=len(problem.marks),
-        poses=int(problem.tied.sum()),
-        sigma0=float(np.sqrt(square / redundancy)) if redundancy > 0 else float("nan"),
-        summary=solution.summary,
-        seconds=seconds,
-    )
-
-
-def _oriented(
-    problem: JointProblem,
-    state: JointState,
-    found: Cofactors,
-    orientation: StationOrientation,
-    rejected: list[RejectedMark],
-) -> StationOrientation:
-    """The station as adjusted with the robot."""
-    on, g, x = np.flatnonzero(problem.active), len(problem.active), state.station
-    whole = np.zeros((g, g))
-    whole[np.ix_(on, on)] = found.shared[: len(on), : len(on)]
-    e, c = problem.counts
-    size = 6 * e + 9 * c
-    to_numbers = np.eye(size)
-    for i, basis in enumerate(interior_basis(x.interior)):
-        at = slice(6 * e + 9 * i, 6 * e + 9 * i + 9)
-        to_numbers[at, at] = basis
-    seen = np.isin(np.arange(len(x.points)), problem.marks.target)
-    both = np.repeat(seen, 3)
-    before = orientation.body.covariance
-    C = whole[size:, size:]
-    if before is not None:
-        C = np.where(np.outer(~both, ~both), before, C)
-    body = replace(orientation.body, points=np.where(seen[:, None], x.points, orientation.body.points), covariance=C)
-    return replace(
-        orientation,
-        cameras=tuple(camera.with_vector(x.interior[i]) for i, camera in enumerate(problem.cameras)),
-        world_T_exterior=x.world_T_exterior,
-        covariance=to_numbers @ whole[:size, :size] @ to_numbers.T,
-        body=body,
-        noise=dict(zip(orientation.names, map(float, problem.noise), strict=True)),
-        rejected=(*orientation.rejected, *rejected),
-    )

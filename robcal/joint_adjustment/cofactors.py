@@ -20,12 +20,15 @@ class Cofactors:
     scatter : (n, 6, 6) of the scatter of each pose.
     marks : (m, 2, 2) redundancy matrices of the whitened marks.
     poses : (n, 6, 6) covariance of the twist of each body, m and rad.
+    robot_alone : (p, p) covariance of the robot's parameters with cameras and body as they were found: against frames
+        that these very cameras measure.
     """
 
     shared: Array
     scatter: Array
     marks: Array
     poses: Array
+    robot_alone: Array
 
 
 def cofactors(problem: JointProblem, here: JointAt, limits: Limits | None) -> Cofactors:
@@ -47,4 +50,5 @@ def cofactors(problem: JointProblem, here: JointAt, limits: Limits | None) -> Co
     twists = np.zeros((len(J), g, 6))
     twists[:, on] = Q[:a, a:] @ np.swapaxes(J, 1, 2) + mixed[:a].transpose(1, 0, 2) @ by_scatter
     marks = mark_redundancy(here.lin, problem.marks, problem.counts, whole, twists, poses)
-    return Cofactors(Q, own, marks, poses)
+    alone = Factor(normals, held=np.arange(len(Q)) < a).cofactors()[a:, a:]
+    return Cofactors(Q, own, marks, poses, alone)

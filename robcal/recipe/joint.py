@@ -10,7 +10,8 @@ from robcal.calibration.joint_log import JointLog
 from robcal.calibration.measurements import frame_observations
 from robcal.calibration.observations import FrameObservations
 from robcal.calibration.verification import fit_nominal
-from robcal.joint_adjustment.adjustment import JointAdjustment, adjust_jointly
+from robcal.joint_adjustment.adjustment import adjust_jointly
+from robcal.joint_adjustment.result import JointAdjustment
 from robcal.photogrammetry.measure.frames import measure_frames
 from robcal.photogrammetry.measure.points import measure_points
 from robcal.photogrammetry.station.network import StationMarks, StationOrientation

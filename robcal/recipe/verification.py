@@ -12,7 +12,7 @@ from robcal.calibration.joint_log import JointLog
 from robcal.calibration.measurements import RobotRecording, Rows, well_measured
 from robcal.calibration.observations import FrameObservations
 from robcal.calibration.verification import Verification, cross_validate, fit_nominal, repetitions, tool_errors, verify
-from robcal.errors import InvalidInput
+from robcal.errors import InvalidInput, NotIdentifiable
 from robcal.recipe.identification import Identification
 from robcal.recipe.robot_diagnosis import RobotDiagnosis
 from robcal.robot.kernel import PoseInputs
@@ -23,6 +23,8 @@ FOLDS = 5
 BLUNDER, LEAST_BLUNDER = 5.0, 0.02
 """A kept-out pose is no measurement of this robot if the nominal one misses it by this factor more than any other pose,
 and by this much (m) more."""
+FAR, FEWEST_OF_A_PLACE = 5.0, 10
+"""Factor by which errors shrink once base and tool are fitted to poses measured elsewhere, and how many these are."""
 SIGMAS = 4.0
 """Standard errors by which the mean of the residuals may differ from zero."""
 
@@ -39,6 +41,7 @@ class RobotVerification:
     unstated : the same without the approach directions that were inferred; None where there are none.
     rows : (n,) rows of the poses in the joint log. notes : what was left out or assumed.
     at_home : whether base and tool were fitted to these very poses, since nothing else tells them.
+    elsewhere : where the kept-out poses lie off together, as from another place or with another tool, in words.
     """
 
     delivered: Verification
@@ -47,6 +50,7 @@ class RobotVerification:
     notes: tuple[str, ...] = ()
     unstated: Verification | None = None
     at_home: bool = False
+    elsewhere: str = ""
 
 
 def verify_robot(
@@ -124,7 +128,37 @@ def verify_robot(
             judged = {name: getattr(told, name) for name in ("normalised", "degrees", "p_value", "coverage_95")}
             outcome = replace(outcome, **judged)
             notes = [*notes, "uncertainties are judged without the faults of the measuring system that were found"]
-    return RobotVerification(outcome, recorded, kept_out, tuple(notes), unstated, bool(foreign))
+    elsewhere = "" if foreign else measured_elsewhere(robot, stated, recording, rows, kept_out)
+    return RobotVerification(
+        outcome, recorded, kept_out, (*notes, *filter(None, [elsewhere])), unstated, bool(foreign), elsewhere
+    )
+
+
+def measured_elsewhere(
+    robot: CalibratedRobot, inputs: PoseInputs, recording: RobotRecording, rows: Rows, kept_out: Rows
+) -> str:
+    """Whether another base and tool explain what the robot misses at the kept-out poses, in words; empty if not."""
+    before = _rms(robot, inputs, recording, kept_out)
+    if len(kept_out) < FEWEST_OF_A_PLACE or before < FAR * _rms(robot, inputs, recording, rows):
+        return ""
+    try:
+        moved = with_fitted_cell(robot.kernel, inputs.subset(kept_out), recording.select(kept_out), anew=True)
+    except NotIdentifiable:  # these poses tell no base and tool: nothing speaks for another place
+        return ""
+    after = _rms(replace(robot, model=moved), inputs, recording, kept_out)
+    if before < FAR * after:
+        return ""
+    return (
+        f"the kept-out poses lie off together: {1e3 * before:.3g} mm as measured, {1e3 * after:.3g} mm once base and "
+        "tool are fitted to them; they were measured from another place or with another tool: list the two recordings "
+        "as instruments of their own"
+    )
+
+
+def _rms(robot: CalibratedRobot, inputs: PoseInputs, recording: RobotRecording, rows: Rows) -> float:
+    """What the robot misses (RMS, m) at rows of a recording."""
+    _, errors = tool_errors(robot.predict(inputs.subset(rows))[0], recording.select(rows))["0"]
+    return float(np.sqrt(np.mean(errors**2)))
 
 
 def kept_out_gain(

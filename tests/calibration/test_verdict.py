@@ -18,6 +18,7 @@ SOUND = Facts(
 )
 
 BROKEN = {
+    "elsewhere": ({"elsewhere": "the kept-out poses lie off together"}, "bad", "lie off together"),
     "gain": ({"after_mm": 1.9}, "bad", "does not make this robot better"),
     "mirrored": ({"mirrored": ("the measured frames are",)}, "bad", "mirrored"),
     "agreement": ({"disagreeing": ("the delivered error is 1 mm, what predict gives 2 mm",)}, "bad", "predict gives 2"),

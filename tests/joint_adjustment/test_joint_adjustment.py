@@ -19,8 +19,9 @@ from robcal.calibration.identification import IdentifiedRobot
 from robcal.calibration.joint_log import JointLog
 from robcal.calibration.measurements import Rows
 from robcal.errors import InvalidInput
-from robcal.joint_adjustment.adjustment import JointAdjustment, adjust_jointly
+from robcal.joint_adjustment.adjustment import adjust_jointly
 from robcal.joint_adjustment.assembly import assemble
+from robcal.joint_adjustment.result import JointAdjustment
 from robcal.photogrammetry.station.network import StationMarks, StationOrientation
 from robcal.transforms import difference
 from tests.pipeline.conftest import edit_yaml

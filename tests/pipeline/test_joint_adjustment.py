@@ -44,11 +44,21 @@ def test_joint_adjustment_of_a_run_and_back(tmp_path: Path) -> None:
     kept = result["verification"]
     assert kept["poses"] == 6
     assert kept["tools"]["0"]["mean"] < 0.3
+    assert kept["coverage_95"] > 0.8
+    assert kept["p_value"] > 1e-3
     edit_yaml(campaign / "campaign.yaml", lambda d: d.update(model={"adjustment": "staged"}))
     done = run_campaign(campaign, out, until="verify")
     assert "adjust" not in done.ran
     assert "adjustment" not in done.result
     assert np.allclose(load_calibrated(run).covariance, staged.covariance)
+
+
+def test_joint_adjustment_of_what_it_does_not_know_is_refused(tmp_path: Path) -> None:
+    make_own(tmp_path, seed=4, robot="ur10", poses=3, verify=1, kept_out=1)
+    stated = {"xyz_mm": [0, 0, 0], "rpy_deg": [0, 0, 0]}
+    edit_yaml(tmp_path / "campaign.yaml", lambda d: d.update(model={"adjustment": "joint"}, flange_T_tool=stated))
+    with pytest.raises(InvalidInput, match="joint' knows nothing of what flange_T_tool states"):
+        read_campaign(tmp_path)
 
 
 def test_joint_adjustment_without_a_station_is_refused(tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from robcal.errors import InvalidInput
-from robcal.files.measurement_tables import read_measurements
+from robcal.files.measurement_tables import read_measurements, unmeasured
 
 POSES = ("a", "b")
 POINT = "pose,target,x_mm,y_mm,z_mm"
@@ -47,7 +47,7 @@ def test_units_and_covariances(tmp_path: Path) -> None:
     assert found.covariance is not None
     assert found.covariance[0] == pytest.approx(1e-6 * np.array([[4, 1, 0], [1, 9, 0], [0, 0, 16]]))
     assert found.pose.tolist() == [1]
-    assert "1 poses have no measurement" in found.notes[0]
+    assert unmeasured([found], POSES) == ["1 poses have no measurement in table.csv (a)"]
     plain = read_measurements(table(tmp_path, f"{POINT},sigma_mm\na,7,0,0,1,2\nb,7,0,0,2,2\n"), POSES)
     assert plain.covariance == pytest.approx(np.tile(4e-6 * np.eye(3), (2, 1, 1)))
 

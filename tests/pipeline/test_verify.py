@@ -1,9 +1,15 @@
 """Which kept-out poses the verification counts."""
 
+from dataclasses import replace
+
 import numpy as np
 
+from robcal import transforms as tf
+from robcal.calibration.identification import identify
 from robcal.calibration.measurements import RobotRecording, well_measured
 from robcal.calibration.observations import FrameObservations
+from robcal.recipe.verification import measured_elsewhere
+from tests.calibration.scenarios import scenario
 
 NAMES = [f"p{i}" for i in range(20)]
 
@@ -29,3 +35,19 @@ def test_evenly_measured_poses_all_count() -> None:
         kept, notes = well_measured(recording(sigma), rows, NAMES)
         np.testing.assert_array_equal(kept, rows)
         assert notes == []
+
+
+def test_kept_out_poses_measured_from_another_place_are_told() -> None:
+    s = scenario(3)
+    robot = identify(s.model, s.poses, [s.frames(s.poses)])
+    rows, kept_out = np.arange(len(s.poses) // 2), np.arange(len(s.poses) // 2, len(s.poses))
+    frames = s.frames(s.poses)
+    still = RobotRecording((frames,), (frames,), True)
+    assert measured_elsewhere(robot, s.poses, still, rows, kept_out) == ""
+    world = tf.frame_from_xyzrpy([0.3, -0.2, 0.1, 0.0, 0.01, 0.02])
+    moved = frames.world_T_tool.copy()
+    moved[kept_out] = world @ moved[kept_out]
+    other = replace(frames, world_T_tool=moved)
+    assert "another place" in measured_elsewhere(
+        robot, s.poses, RobotRecording((other,), (other,), True), rows, kept_out
+    )

@@ -12,7 +12,7 @@ from itertools import pairwise
 import numpy as np
 
 from robcal.estimation.schur import Normals
-from robcal.photogrammetry.core.camera import Camera, project_with_jacobians
+from robcal.photogrammetry.core.camera import Camera, project, project_with_jacobians
 from robcal.photogrammetry.core.network import ImageMarks, IntArray
 from robcal.transforms import Array, retract
 
@@ -61,14 +61,7 @@ def whitened_residuals(state: State, order: MarkOrder, shift: Array) -> Array:
     marks = order.marks
     R, t = state.camera_T_body[:, :3, :3], state.camera_T_body[:, :3, 3]
     p = np.einsum("mij,mj->mi", R[marks.image], state.points[marks.target]) + t[marks.image]
-    c = state.camera
-    z = np.where(p[:, 2] > 0, p[:, 2], np.nan)
-    x, y = p[:, 0] / z, p[:, 1] / z
-    r2 = x * x + y * y
-    radial = 1.0 + r2 * (c.k1 + r2 * (c.k2 + r2 * c.k3))
-    u = c.fx * (x * radial + 2.0 * c.p1 * x * y + c.p2 * (r2 + 2.0 * x * x)) + c.cx
-    v = c.fy * (y * radial + c.p1 * (r2 + 2.0 * y * y) + 2.0 * c.p2 * x * y) + c.cy
-    r = marks.xy - shift - np.stack([u, v], axis=1)
+    r = marks.xy - shift - project(state.camera, p)
     return np.einsum("mij,mj->mi", order.whitener, r)
 
 

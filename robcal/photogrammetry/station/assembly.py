@@ -6,8 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from robcal.errors import InvalidInput
+from robcal.photogrammetry.core.adjustable import adjustable_names
 from robcal.photogrammetry.core.bodies import Body, IntArray
-from robcal.photogrammetry.core.camera import Camera
+from robcal.photogrammetry.core.camera import INTRINSIC_NAMES, Camera
 from robcal.photogrammetry.station.adjustment import interior_prior
 from robcal.photogrammetry.station.network import GROUPS, MarkTable, Prior, StationMarks, StationSettings, Unknowns
 from robcal.photogrammetry.station.start import ImageStart
@@ -51,7 +52,8 @@ def interior_groups(
     kept: list[set[str]] = []
     for name in names:
         camera = cameras.get(name)
-        tried.append(set() if settings.intrinsics == "fixed" else set(GROUPS))
+        groups = set(GROUPS) if camera is None else _carried(camera)
+        tried.append(set() if settings.intrinsics == "fixed" else groups)
         if settings.intrinsics != "auto":
             kept.append(set(tried[-1]))
             continue
@@ -60,8 +62,14 @@ def interior_groups(
             keep |= {n for n in ("k1", "k2", "k3") if getattr(camera, n) != 0.0}
             keep |= {"tangential"} if camera.p1 or camera.p2 else set()
             keep |= {"affinity"} if camera.fx != camera.fy else set()
-        kept.append(keep)
+        kept.append(keep & tried[-1])
     return tried, kept
+
+
+def _carried(camera: Camera) -> set[str]:
+    """Groups of numbers that the camera's lens has."""
+    have = {INTRINSIC_NAMES.index(name) for name in adjustable_names(camera)}
+    return {group for group, numbers in GROUPS.items() if set(numbers) <= have}
 
 
 def assemble(station: StationInput, start: StationStart) -> StationState:

@@ -12,6 +12,7 @@ import numpy as np
 from robcal.errors import InvalidInput
 from robcal.photogrammetry.bundle.colmap_engine import adjust_with_colmap
 from robcal.photogrammetry.bundle.datum import DatumSpec
+from robcal.photogrammetry.core.adjustable import adjustable, adjustable_names
 from robcal.photogrammetry.core.bodies import Body
 from robcal.photogrammetry.core.camera import Camera
 from robcal.photogrammetry.core.discs import facing_normals
@@ -100,7 +101,8 @@ def survey_body(  # noqa: PLR0913 - options by keyword
 
     Parameters
     ----------
-    size : (width, height) of the images in px. camera : start values, or None (then from the image size alone).
+    size : (width, height) of the images in px. camera : start values, or None (then from the image size alone);
+        other lenses keep what they have beyond the nine numbers.
     datum : 'free', 'bars' or ids of targets held at their given coordinates.
 
     Raises
@@ -110,6 +112,12 @@ def survey_body(  # noqa: PLR0913 - options by keyword
     NotIdentifiable : the scale or the interior orientation is not determined.
     """
     settings = settings or SurveySettings()
+    if camera is not None:
+        camera = adjustable(camera)
+        carried = tuple(name for name in settings.free_intrinsics if name in adjustable_names(camera))
+        settings = replace(settings, free_intrinsics=carried)
+        if engine == "pycolmap" and type(camera) is not Camera:
+            raise InvalidInput("engine pycolmap adjusts Brown's lens alone: use engine robcal with this camera file")
     bars, checks = scale_bars or Lengths.none(), check_lengths or Lengths.none()
     if engine not in ("robcal", "pycolmap"):
         raise InvalidInput(f"bundle engine {engine!r} is unknown: choose robcal or pycolmap")
