@@ -81,8 +81,10 @@ class JointDelivery:
 
 @dataclass(frozen=True)
 class InstrumentFolds:
-    """Forms of a robot compared at all instruments, each a part of ``found``, which has everything that was told and was
-    identified from ``model``."""
+    """Forms of a robot compared at all instruments, each a part of ``found``, which has everything that was told.
+
+    ``model`` : the robot with its terms that ``found`` was identified from.
+    """
 
     model: RobotModel = field(repr=False)
     found: IdentifiedInstruments = field(repr=False)

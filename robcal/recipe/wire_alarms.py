@@ -49,7 +49,8 @@ def wire_alarms(
 
     Parameters
     ----------
-    model : the robot that was identified. options : as for the identification; its priors are what is believed of single parameters.
+    model : the robot that was identified from.
+    options : as for the identification; its priors are what is believed of single parameters.
     """
     identified = [p for p in found.placed.values() if p.robot is not None and not p.instrument.loop]
     robot = identified[0].robot if identified else None
@@ -58,9 +59,10 @@ def wire_alarms(
     options = options or IdentifyOptions()
     links = _links(robot)
     # without a stated prior a link may be off by anything: robots of old drawings are
+    off = {n: robot.values[n] - model.parameters.get(n, 0.0) for n in links}
     stated = {n: options.priors[n] for n in links if n in options.priors}
-    far = [n for n in stated if abs(robot.values[n]) - USUAL_LENGTH > SURE * np.hypot(_sigma(robot, n), stated[n])]
-    told = [f"{n} {1e3 * robot.values[n]:+.2f} +- {1e3 * _sigma(robot, n):.2g} mm" for n in far]
+    far = [n for n in stated if abs(off[n]) - USUAL_LENGTH > SURE * np.hypot(_sigma(robot, n), stated[n])]
+    told = [f"{n} {1e3 * off[n]:+.2f} +- {1e3 * _sigma(robot, n):.2g} mm" for n in far]
     reason = f"links are off by more than links may be ({', '.join(told)}), which a fault of the wire does"
     best = 0.0
     for placed in identified:
@@ -74,8 +76,7 @@ def wire_alarms(
             if strength > max(SURE, best) and moved:
                 best = strength
                 reason = f"a wire that {WORDS[kind]} explains it better than links that are off: " + ", ".join(
-                    f"{n} {1e3 * robot.values[n]:+.2f} mm would be {1e3 * (robot.values[n] + v):+.2f} mm"
-                    for n, v in moved.items()
+                    f"{n} {1e3 * off[n]:+.2f} mm would be {1e3 * (off[n] + v):+.2f} mm" for n, v in moved.items()
                 )
     if not far and best == 0.0:
         return []
@@ -94,7 +95,8 @@ def scale_by_lengths(
 
     Parameters
     ----------
-    model : the robot that was identified. name : of the instrument. recording : its measurements as the diagnosis takes them.
+    model : the robot that was identified from. name : of the instrument.
+    recording : its measurements as the diagnosis takes them.
     """
     robot = found.placed[name].robot
     if robot is None:
