@@ -76,8 +76,8 @@ def run(name: str, seed: int) -> Row:
     r, _ = wire.recording.select(wire.sound)[0].evaluate(
         wire.robot.predict(wire.robot.inputs(log).subset(wire.sound))[0]
     )
-    named = ", ".join(f"{t.finding.cause.name} {_numbers(t.finding.parameters)}" for t in done.told)
-    named = named or "; ".join("scale cannot be told" for _ in done.not_told) or "nothing"
+    named = ", ".join(f"{t.finding.cause.name} {_numbers(t.finding.parameters)}" for t in done.reported)
+    named = named or "; ".join("scale cannot be told" for _ in done.not_separable) or "nothing"
     inputs = log.inputs(wire.robot.kernel).subset(wire.sound)
     nominal = fit_nominal(model, inputs, wire.recording.select(wire.sound))
     errors = [_error(before, m) for m in (nominal.model, wire.robot.model, _robot(done.found), _robot(ideal))]

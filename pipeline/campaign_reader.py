@@ -42,7 +42,7 @@ from robcal.files.tables import FaultyRows, Table, read_table
 from robcal.files.yaml_io import read_yaml
 from robcal.photogrammetry.core.adjustable import adjustable
 from robcal.physics.gravity_sag import without_masses
-from robcal.robot.chain import chain_of, forward
+from robcal.robot.hexapod import nominal_frames
 from robcal.robot.model import RobotModel
 
 T = TypeVar("T")
@@ -172,7 +172,7 @@ class _Reader:
         if entry.poses is not None:
             poses = self._part(partial(self._poses, entry.poses, robot))
             self.notes.extend(poses.notes if poses is not None else ())
-        if robot is not None and entry.poses is not None and without_masses(robot):
+        if robot is not None and entry.poses is not None and not robot.is_hexapod and without_masses(robot):
             self.notes.append(
                 "the robot file states no masses (mass_kg, cog_mm): sag under the arm's own weight is identified where "
                 "the poses show it, but what another payload does to the arm cannot be predicted"
@@ -216,7 +216,7 @@ class _Reader:
         sound = self.faults is None or known == self.pose_names
         places = None
         if robot is not None and poses is not None and sound and poses.q.shape[1]:
-            places = forward(chain_of(robot), poses.q)[:, :3, 3]
+            places = nominal_frames(robot, poses.q)[:, :3, 3]
 
         def read(use: TableUse, table: Table) -> MeasuredTable:
             found = self._measurements(use, table, known if sound else self.pose_names, robot)

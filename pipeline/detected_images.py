@@ -83,9 +83,9 @@ def check_images(source: str, images: ImageSource, entries: Sequence[ImageEntry]
         )
     empty = [entry for entry in own if entry.targets == 0]
     if len(empty) == len(own):
-        told = next((f" ({entry.message})" for entry in empty if entry.message), "")
+        why = next((f" ({entry.message})" for entry in empty if entry.message), "")
         raise InvalidInput(
-            f"{own[0].path.parent}: no targets found in any of {len(own)} images{told}: check exposure, focus and that "
+            f"{own[0].path.parent}: no targets found in any of {len(own)} images{why}: check exposure, focus and that "
             "these are images of the body (bright dots on dark ground unless 'polarity: dark')"
         )
     notes = [f"{entry.path}: {entry.message or 'no targets found'}: the image is left out" for entry in empty]

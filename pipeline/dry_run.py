@@ -116,6 +116,6 @@ def plan_lines(data: dict[str, Any]) -> list[str]:
     for stage in data["stages"]:
         names = stage["inputs"]
         files = ", ".join(names) if len(names) <= 3 else f"{names[0]} and {len(names) - 1} more files"
-        told = f"{stage['why']}{f'; from {files}' if files else ''}; about {stage['seconds']:.0f} s"
-        lines.append(f"{stage['stage']}: {told if stage['runs'] else 'up to date'}")
+        message = f"{stage['why']}{f'; from {files}' if files else ''}; about {stage['seconds']:.0f} s"
+        lines.append(f"{stage['stage']}: {message if stage['runs'] else 'up to date'}")
     return [*lines, f"into {data['run']}, about {data['seconds']:.0f} s in all; nothing was done"]

@@ -15,7 +15,7 @@ from robcal.calibration.verification import Verification
 from robcal.diagnosis.of_instruments import Attributed, instruments_content
 from robcal.diagnosis.search.selection import SelectionSettings
 from robcal.recipe.instruments import verify_instruments
-from robcal.recipe.instruments_diagnosis import Told, diagnose_instruments
+from robcal.recipe.instruments_diagnosis import ReportedCause, diagnose_instruments
 
 STAGES: Mapping[str, str] = {"distances": "wire", "sensor_points": "sensor"}
 """Stage of the measuring chain by the kind of an instrument; of all others the camera."""
@@ -35,34 +35,36 @@ def diagnose_several(context: Context, settings: SelectionSettings) -> Outcome:
     leading = found.leading if found.leading in done.own else next(iter(done.own))
     run.artifact(DIAGNOSED_INSTRUMENTS).unlink(missing_ok=True)  # of a diagnosis before
     gain, outputs = None, [run.diagnosis]
-    if done.told:
+    if done.reported:
         gain = (
             _kept_out(verify_instruments(robot, found, poses, options)),
             _kept_out(verify_instruments(robot, done.found, poses, options)),
         )
         outputs.append(run.save(DIAGNOSED_INSTRUMENTS, replace(done.found, notes=(*done.found.notes, *done.notes))))
-    told = [_attributed(t, done.found.placed) for t in done.told]
+    reported = [_attributed(t, done.found.placed) for t in done.reported]
     decided: dict[str, object] = {"in_force": done.in_force}
     if done.decided is not None:
         errors = {"identified": 1e3 * done.decided.identified, "diagnosed": 1e3 * done.decided.diagnosed_error}
         decided |= {"in_force_reason": done.decided.reason, "delivered_mm": errors}
-    content = instruments_content(done.own, told, leading, gain, done.not_told) | decided
+    content = instruments_content(done.own, reported, leading, gain, done.not_separable) | decided
     write_json(run.diagnosis, content)
-    statements = [t.statement for t in done.told] or ["nothing missing: the model explains the data"]
+    statements = [t.statement for t in done.reported] or ["nothing missing: the model explains the data"]
     causes = [
         {"cause": t.finding.cause.name, "where": t.finding.cause.where, "direction": t.finding.cause.direction}
         | {"instrument": t.instrument}
-        for t in done.told
+        for t in done.reported
     ]
     result = {key: content[key] for key in ("mismatch", "p_value", "heldout_mm", "not_told")} | decided
-    return Outcome({"diagnosis": result | {"causes": causes}}, outputs, [*statements, *done.not_told, *done.notes])
+    return Outcome({"diagnosis": result | {"causes": causes}}, outputs, [*statements, *done.not_separable, *done.notes])
 
 
-def _attributed(told: Told, placed: Mapping[str, PlacedInstrument]) -> Attributed:
-    stage = str(told.finding.cause.stage)
-    if told.contradicting:
-        stage = STAGES.get(placed[told.instrument].instrument.kind, "camera")
-    return Attributed(told.finding, told.instrument, told.agreeing, told.contradicting, stage, told.statement)
+def _attributed(reported: ReportedCause, placed: Mapping[str, PlacedInstrument]) -> Attributed:
+    stage = str(reported.finding.cause.stage)
+    if reported.contradicting:
+        stage = STAGES.get(placed[reported.instrument].instrument.kind, "camera")
+    return Attributed(
+        reported.finding, reported.instrument, reported.agreeing, reported.contradicting, stage, reported.statement
+    )
 
 
 def _kept_out(verified: Mapping[str, Verification]) -> float:

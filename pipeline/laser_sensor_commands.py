@@ -33,8 +33,8 @@ def calibrate(
         answer.update(calibrate_from(table, kind, out, aim_mm))
         for row in answer["odd_rows"]:
             LOG.warning(f"{table}, row {row}: the reading is off by more than five standard deviations of all others")
-        told = ", ".join(f"{name} to {value:.3g}" for name, value in answer["noise"].items())
-        LOG.info(f"sensor of kind '{kind}' from {answer['places']} places in {out}: {told}")
+        message = ", ".join(f"{name} to {value:.3g}" for name, value in answer["noise"].items())
+        LOG.info(f"sensor of kind '{kind}' from {answer['places']} places in {out}: {message}")
 
 
 @sensor.command("points")

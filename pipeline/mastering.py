@@ -197,17 +197,17 @@ def master_notch(path: Path) -> dict[str, float]:
 
 
 def _warnings(campaign: Campaign, found: Mastering, free: Sequence[str]) -> list[str]:
-    told = []
+    reported = []
     if free:
-        told.append(
+        reported.append(
             f"{campaign.path}: {' and '.join(free)} are not those of the calibration (another instrument) and were "
             "estimated as well"
         )
     for axis, tied in found.unobservable.items():
-        told.append(f"{axis}: cannot be told from {', '.join(tied) or 'these measurements'}")
+        reported.append(f"{axis}: cannot be told from {', '.join(tied) or 'these measurements'}")
     if found.p_value < 0.01:
-        told.append(
+        reported.append(
             f"the residuals are {found.sigma0:.1f} times as large as stated: the noise was estimated from them; is it "
             "the same tool and world as in the calibration?"
         )
-    return told
+    return reported

@@ -151,7 +151,7 @@ def track(items: Iterable[T], total: int, label: str) -> Iterator[T]:
     """Yield items while a progress bar with the time left moves on a terminal; without one, a line now and then."""
     console = _terminal()
     if console is None:
-        yield from _told(items, total, label)
+        yield from _logged(items, total, label)
         return
     from rich.progress import track as bar
 
@@ -160,7 +160,7 @@ def track(items: Iterable[T], total: int, label: str) -> Iterator[T]:
     yield from bar(items, label, total, console=console, transient=True)
 
 
-def _told(items: Iterable[T], total: int, label: str) -> Iterator[T]:
+def _logged(items: Iterable[T], total: int, label: str) -> Iterator[T]:
     begin = last = time.monotonic()
     for k, item in enumerate(items):
         now = time.monotonic()

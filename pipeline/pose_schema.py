@@ -7,7 +7,7 @@ from pydantic import BeforeValidator, Field
 
 from robcal.calibration.collision import Ball, Box, Capsule, HalfSpace, Obstacle
 from robcal.errors import InvalidInput
-from robcal.files.robot_file import PayloadEntry, PlacementEntry
+from robcal.files.placement import PayloadEntry, PlacementEntry
 from robcal.files.schemas import Entry, NotNegative, Number, Positive, Text, Triple, Whole
 
 FORMAT = "robcal/poses-1"

@@ -116,9 +116,9 @@ def verification_section(found: RobotVerification) -> dict[str, Any]:
 
 def verdict_section(judged: Verdict, kept: Conformity | None) -> dict[str, Any]:
     """Section `verdict`; `tolerance` where the campaign states one."""
-    told: dict[str, Any] = {"grade": judged.grade, "text": judged.text, "reasons": list(judged.reasons)}
+    reported: dict[str, Any] = {"grade": judged.grade, "text": judged.text, "reasons": list(judged.reasons)}
     if kept is not None:
-        told["tolerance"] = {
+        reported["tolerance"] = {
             "tolerance_mm": kept.tolerance * 1000,
             "kept": kept.kept,
             "places": kept.places,
@@ -130,7 +130,7 @@ def verdict_section(judged: Verdict, kept: Conformity | None) -> dict[str, Any]:
             "share_kept_95": kept.share,
             "statement": kept.statement,
         }
-    return told
+    return reported
 
 
 def noise_section(noise: NoiseParts) -> dict[str, Any]:

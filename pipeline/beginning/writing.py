@@ -177,7 +177,7 @@ def _measured(
 ) -> None:
     tables = found.of("frames", "points", "distances", "sensor_points")
     uses = [_use(found, table) for table in tables]
-    told = "; ".join(f"{_relative(found, t.path)}: {t.kind}" for t in tables)
+    message = "; ".join(f"{_relative(found, t.path)}: {t.kind}" for t in tables)
     if station and body is not None:
         out.add({"station": {"cameras": {n: FlowMapping(e) for n, e in station.items()}, "body": body}})
         if len(found.bodies) > 1:
@@ -185,11 +185,11 @@ def _measured(
                 f"station.body: the robot carries '{body}'? also here: {', '.join(p.stem for p in found.bodies)}"
             )
         if uses:
-            out.remark(f"not used beside the station: {told}; list each under 'instruments' to use both")
+            out.remark(f"not used beside the station: {message}; list each under 'instruments' to use both")
     elif uses:
         if poses is None:
-            out.remark(f"not used without poses: {told}")
+            out.remark(f"not used without poses: {message}")
             return
-        out.add({"measurements": uses[0] if len(uses) == 1 else uses}, told)
+        out.add({"measurements": uses[0] if len(uses) == 1 else uses}, message)
         if body is not None and len(found.bodies) > 1:
             out.add({"body": body}, "the one that was measured")

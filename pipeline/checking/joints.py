@@ -3,7 +3,7 @@
 import numpy as np
 
 from pipeline.campaign import Campaign
-from robcal.robot.chain import chain_of, forward
+from robcal.robot.hexapod import nominal_frames
 
 Looked = tuple[list[str], list[str]]
 """Faults that stop a run, and what is doubtful; a sentence each."""
@@ -68,7 +68,7 @@ def joint_doubts(campaign: Campaign) -> Looked:
     again = len(places) - len(np.unique(places, axis=0))
     if again > len(places) // 2:
         doubts.append(f"{where}: {again} of {len(places)} rows repeat the angles of others: they add no new poses")
-    reach = forward(chain_of(robot), poses.q)[:, :3, 3]
+    reach = nominal_frames(robot, poses.q)[:, :3, 3]
     if len(poses) > 2 and np.ptp(reach, axis=0).max() < 0.05:
         doubts.append(f"{where}: all poses lie within 50 mm: the model will hold there only: spread them")
     return faults, doubts

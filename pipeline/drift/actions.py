@@ -18,7 +18,7 @@ from pipeline.stages.identify import load_calibrated
 from robcal.drift.control import DriftControl, started
 from robcal.drift.reference import DriftReference, DriftSettings, freeze
 from robcal.errors import InvalidInput
-from robcal.files.robot_file import PlacementEntry
+from robcal.files.placement import PlacementEntry
 from robcal.files.storage import sha256_of
 from robcal.files.yaml_io import read_yaml
 from robcal.robot.kernel_cache import kernel_of

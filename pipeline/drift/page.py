@@ -86,7 +86,7 @@ def _html(place: Path | str, tours: Sequence[Any], alarms: Sequence[Any], figure
         if last is not None
         else "no tour is complete yet"
     )
-    told = "".join(f"<li>cycle {a.cycle}: <b>{a.kind}</b>: {html.escape(a.text)}</li>" for a in alarms[-100:])
+    message = "".join(f"<li>cycle {a.cycle}: <b>{a.kind}</b>: {html.escape(a.text)}</li>" for a in alarms[-100:])
     plots, calls = "", []
     for k, (title, unit, data) in enumerate(figures):
         plots += f'<h2>{html.escape(title)}</h2><div id="p{k}" class="plot"></div>'
@@ -110,6 +110,6 @@ def _html(place: Path | str, tours: Sequence[Any], alarms: Sequence[Any], figure
         f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{name}: drift</title>'
         "<style>body{font:16px/1.5 sans-serif;max-width:75rem;margin:2rem auto;padding:0 1rem}</style></head>"
         f"<body><h1>Drift of {name}</h1><p>{stands}</p><h2>Alarms</h2>"
-        f"{f'<ul>{told}</ul>' if told else '<p>none</p>'}{plots}"
+        f"{f'<ul>{message}</ul>' if message else '<p>none</p>'}{plots}"
         f"<script>{get_plotlyjs()}</script><script>{script}</script></body></html>"
     )

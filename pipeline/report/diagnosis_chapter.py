@@ -59,8 +59,8 @@ def short_statement(d: Mapping[str, Any], most: int = 3) -> str:
     causes = d.get("causes") or []
     if len(causes) <= most:
         return str(d.get("statement") or "")
-    told = ". ".join(str(c.get("statement") or said(c.get("cause"))) for c in causes[:most])
-    return f"{told}. And {len(causes) - most} more, see below."
+    message = ". ".join(str(c.get("statement") or said(c.get("cause"))) for c in causes[:most])
+    return f"{message}. And {len(causes) - most} more, see below."
 
 
 def said(name: object) -> str:
@@ -125,7 +125,7 @@ def _causes(causes: list[dict[str, Any]]) -> Table:
 def _parameter(name: str, value: Any, sigma: Any) -> str:
     unit = ""
     shown = name
-    for suffix, told in (
+    for suffix, message in (
         ("_deg_per_kNm3", "deg/kNm³"),
         ("_deg_per_kNm", "deg/kNm"),
         ("_um_per_m_K", "µm/(m K)"),
@@ -138,7 +138,7 @@ def _parameter(name: str, value: Any, sigma: Any) -> str:
         ("_px", "px"),
     ):
         if name.endswith(suffix) and name != suffix:
-            shown, unit = name.removesuffix(suffix).replace("_", " ") or "amount", f" {told}"
+            shown, unit = name.removesuffix(suffix).replace("_", " ") or "amount", f" {message}"
             break
     if isinstance(value, dict):
         formula = str(value.get("formula") or value.get("kind") or value)
@@ -291,15 +291,15 @@ def _rivals(cause: Mapping[str, Any]) -> list[Block]:
         return []
     rows = [[said(r.get("cause")), str(r.get("where")), r.get("direction") or ""] for r in rivals]
     columns = ["Rival", "Where", "Direction"]
-    told = f"These explain the recording (nearly) as well as {said(cause.get('cause'))} at {cause.get('where')}. "
+    message = f"These explain the recording (nearly) as well as {said(cause.get('cause'))} at {cause.get('where')}. "
     for key in ("probability", "overlap"):
         if any(r.get(key) is not None for r in rivals):
             columns.append(key.capitalize())
             rows = [[*row, _share(r.get(key))] for row, r in zip(rows, rivals, strict=True)]
     if "Overlap" in columns:
-        told += "Overlap is the share of its signature that the rival can reproduce. "
-    told += "Predictions within the measured range are the same, whichever it is."
-    return [table(columns, rows, told, text=(0, 1, 2))]
+        message += "Overlap is the share of its signature that the rival can reproduce. "
+    message += "Predictions within the measured range are the same, whichever it is."
+    return [table(columns, rows, message, text=(0, 1, 2))]
 
 
 def _share(value: Any) -> str:

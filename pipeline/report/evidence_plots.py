@@ -23,12 +23,14 @@ def evidence_figure(evidence: CauseEvidence, cause: str, poses: Mapping[str, int
     data: list[dict[str, Any]] = []
     groups: list[tuple[Array, str, str]] = [(np.ones(len(x), dtype=bool), "", AFTER)]
     if state is not None:
-        groups = [(state == s, f", {told}", colour) for s, (colour, told) in _STATES.items() if np.any(state == s)]
-    for which, told, colour in groups:
+        groups = [
+            (state == s, f", {message}", colour) for s, (colour, message) in _STATES.items() if np.any(state == s)
+        ]
+    for which, message, colour in groups:
         for out, symbol, name in ((False, "circle", "single pose"), (True, "diamond-open", "kept-out pose")):
             mine = which & (evidence.kept_out == out)
             if mine.any():
-                point = _points(evidence, mine, x, factor, (colour, symbol), f"{name}{told}", unit)
+                point = _points(evidence, mine, x, factor, (colour, symbol), f"{name}{message}", unit)
                 rows = [poses.get(p) for p, m in zip(evidence.poses, mine, strict=True) if m]
                 data.append({**point, "customdata": rows})
         means = _means(x[which], evidence.measured[which] * factor, evidence.sigma[which] * factor)
@@ -37,7 +39,7 @@ def evidence_figure(evidence: CauseEvidence, cause: str, poses: Mapping[str, int
                 trace(
                     "scatter markers",
                     (rounded(means[0]), rounded(means[1])),
-                    f"mean of neighbours{told}",
+                    f"mean of neighbours{message}",
                     error_y={"type": "data", "array": rounded(means[2]), "color": colour, "thickness": 2, "width": 4},
                     marker={"color": colour, "size": 11, "line": {"color": "#fff", "width": 1.5}, "symbol": "square"},
                 )
@@ -146,10 +148,10 @@ def _law(e: CauseEvidence, x: Array, factor: float) -> list[dict[str, Any]]:
     for k, (name, (grid, value)) in enumerate(e.curves.items()):
         shown, _ = abscissa(first, grid)
         state = name.split()[-1] if name.startswith("approach") else ""
-        told = f"fitted law, {_STATES[float(state)][1]}" if state else "fitted law"
+        message = f"fitted law, {_STATES[float(state)][1]}" if state else "fitted law"
         colour = _STATES[float(state)][0] if state else ACCENT
         line = {"color": INK if not state else colour, "width": 3, "dash": dashes[k % 3]}
-        out.append(trace("scatter lines", (rounded(shown, 5), rounded(value * factor)), told, line=line))
+        out.append(trace("scatter lines", (rounded(shown, 5), rounded(value * factor)), message, line=line))
     if not out:
         order = np.argsort(x, kind="stable")
         mark = {"color": GREEN, "symbol": "line-ew-open", "size": 12, "line": {"width": 2.5}}

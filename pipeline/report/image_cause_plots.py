@@ -46,11 +46,13 @@ def lens_figure(name: str, camera: Camera, covariance: Array, marks: Array) -> F
             "scatter lines", ([x[0], x[-1]], [0, 0]), "camera file", line={"color": BEFORE, "width": 2, "dash": "dash"}
         ),
     ]
-    told = f"Radial distortion of {label(name)} out to the outermost target: the camera file has none, the images do."
+    message = (
+        f"Radial distortion of {label(name)} out to the outermost target: the camera file has none, the images do."
+    )
     return Figure(
         tuple(data),
         layout("distance from the principal point (px)", "radial shift (px)"),
-        told,
+        message,
         f"Radial distortion of {name}",
         height=320,
     )

@@ -163,3 +163,8 @@ class Material:
     def pose_name(self, row: int) -> str:
         """Name of a pose."""
         return self.pose_names[row] if 0 <= row < len(self.pose_names) else f"row {row + 1}"
+
+
+def is_platform(material: Material) -> bool:
+    """Whether the robot is a Stewart platform, which has legs in place of joint angles."""
+    return material.calibrated is not None and bool(material.calibrated.model.is_hexapod)

@@ -3,7 +3,7 @@
 from collections import Counter
 
 from pipeline.report.blocks import Block, Bullets, Chapter, Text, table
-from pipeline.report.material import Material
+from pipeline.report.material import Material, is_platform
 from pipeline.report.style import number
 
 
@@ -78,13 +78,17 @@ def files_chapter(material: Material) -> Chapter:
         rows += [[f"{folder}/{p.name}", what] for p in sorted((run.folder / folder).glob("*.yaml"))]
     blocks.append(table(["File", "What it is"], rows, text=(0, 1)))
     if run.robot.is_file():
+        legs = is_platform(material)
+        commanded = "leg lengths" if legs else "joint angles"
         commands = [
-            ["pipeline compensate RUN --frames wanted.csv --out q.csv", "joint angles that bring the real tool there"],
+            ["pipeline compensate RUN --frames wanted.csv --out q.csv", f"{commanded} that bring the real tool there"],
             [
                 "pipeline compensate RUN --frames wanted.csv --out targets.csv --as frames --in base",
                 "corrected Cartesian targets, which most controllers load",
             ],
-            ["pipeline export RUN --c controller/ --urdf robot.urdf", "C99 for the controller; geometry as URDF"],
+            ["pipeline export RUN --data out/", "parameters with their covariance, for programs"]
+            if legs
+            else ["pipeline export RUN --c controller/ --urdf robot.urdf", "C99 for the controller; geometry as URDF"],
             ["pipeline predict RUN --poses poses.csv --out frames.csv", "where the tool really is, with sigmas"],
         ]
         blocks.append(table(["Command", "Gives"], commands, "What to load into the controller.", text=(0, 1)))

@@ -107,12 +107,12 @@ def _station(station: StationOrientation) -> list[Block]:
                 "stood still" if epochs == 1 else f"moved {epochs - 1} times",
             ]
         )
-    told = (
+    message = (
         f"Station: {len(station.poses)} poses, redundancy {station.redundancy_total:.0f}, "
         f"sigma0 {number(station.sigma0)}, residuals {number(station.rms_px)} px RMS."
     )
     blocks: list[Block] = [
-        table(["Camera", "Marks", "Scatter / stated", "Refined", "Stand"], rows, told, text=(0, 3, 4))
+        table(["Camera", "Marks", "Scatter / stated", "Refined", "Stand"], rows, message, text=(0, 3, 4))
     ]
     sigmas = {
         name: (camera, np.sqrt(np.clip(np.diag(station.camera_covariance(name)[1]), 0, None)))
@@ -194,8 +194,8 @@ def _network(name: str, network: CameraNetwork) -> Figure:
         _lines(_camera_lines(body_T_camera, 0.06 * extent), "cameras", AFTER),
         _dots(body_T_camera[:, :3, 3], list(network.image_names), "camera positions", AFTER, 2.5),
     )
-    told = f"Survey of {name}: {len(network.image_names)} photographs, {len(network.ids)} targets."
-    return Figure(data, scene(data), told, "Cameras and targets of the survey in space", height=480)
+    message = f"Survey of {name}: {len(network.image_names)} photographs, {len(network.ids)} targets."
+    return Figure(data, scene(data), message, "Cameras and targets of the survey in space", height=480)
 
 
 def _station_scene(station: StationOrientation, material: Material) -> Figure:

@@ -10,7 +10,7 @@ from pipeline.artifacts import CORRECTED, HAND_EYE
 from pipeline.report.blocks import Grade, KeyFigure, Verdict
 from pipeline.report.diagnosis_chapter import short_statement
 from pipeline.report.hand_eye_chapter import hand_eye_verdict
-from pipeline.report.material import Material
+from pipeline.report.material import Material, is_platform
 from pipeline.report.style import number, percent, probability
 from pipeline.report.verification_chapter import error_table, noise_by_tool
 from robcal.calibration.observations import FrameObservations
@@ -93,6 +93,8 @@ def _robot(material: Material, v: Verification) -> Verdict:
         "robot_calibrated.yaml; corrected targets or joint angles by 'pipeline compensate', code for the controller by "
         "'pipeline export'."
     )
+    if is_platform(material):
+        load = "robot_calibrated.yaml; leg lengths or corrected targets by 'pipeline compensate'."
     if before is not None and after.rms >= before.rms:
         load = "Keep the nominal robot: the identified one is no better at poses that were kept out."
     elif grade == "bad":

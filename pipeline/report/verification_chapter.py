@@ -64,10 +64,10 @@ def error_table(verification: Verification, noise: Mapping[str, float], *, full:
         place = _tool(name, verification)
         floor = number(noise[name] * mm) if name in noise else "–"
         if full:
-            for told, errors in (("before", before), ("after", after)):
+            for message, errors in (("before", before), ("after", after)):
                 if errors is not None:
                     kinds = (errors.mean, errors.min, errors.max, errors.std, errors.rms)
-                    rows.append([place, told, *(number(v * mm) for v in kinds)])
+                    rows.append([place, message, *(number(v * mm) for v in kinds)])
             if name in noise:
                 rows.append([place, "noise of the measurement alone", "", "", "", "", floor])
             continue
@@ -126,8 +126,8 @@ def _lead(material: Material) -> str:
 
 def tolerance_mm(material: Material) -> float | None:
     """The tolerance that the run was judged by."""
-    told = (material.result.get("verdict") or {}).get("tolerance")
-    return None if told is None else float(told["tolerance_mm"])
+    tolerance = (material.result.get("verdict") or {}).get("tolerance")
+    return None if tolerance is None else float(tolerance["tolerance_mm"])
 
 
 def _errors(v: Verification, names: list[str], rows: Rows, tolerance: float | None) -> Figure:
@@ -140,7 +140,7 @@ def _errors(v: Verification, names: list[str], rows: Rows, tolerance: float | No
         data.append(_dots(order, v.nominal_errors["0"] * 1000, "before (nominal, best cell)", BEFORE, rows))
     data.append(_dots(order, size, "after (calibrated)", AFTER, rows))
     lines = [] if tolerance is None else [level_line("y", tolerance)]
-    told = "" if tolerance is None else f" Dashed: tolerance, {number(tolerance)} mm."
+    message = "" if tolerance is None else f" Dashed: tolerance, {number(tolerance)} mm."
     return Figure(
         tuple(data),
         layout(
@@ -150,7 +150,7 @@ def _errors(v: Verification, names: list[str], rows: Rows, tolerance: float | No
             yaxis={"type": "log", "dtick": "D2"},
             shapes=lines,
         ),
-        f"Error at the tool's origin, pose by pose.{told} Click a pose to see it in all plots, rows and images.",
+        f"Error at the tool's origin, pose by pose.{message} Click a pose to see it in all plots, rows and images.",
         "Error of each pose before and after calibration",
     )
 

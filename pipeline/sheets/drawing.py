@@ -83,10 +83,10 @@ class Sheet:
         for k in range(int(length / 10) + 1):
             tick = 2.5 if k % 5 == 0 else 1.5
             canvas.line(*self._xy(self.margin + 10 * k, y - 5), *self._xy(self.margin + 10 * k, y - 5 - tick))
-        told = (
+        message = (
             f"{length:g} mm: measure it; print at 100 %, without fitting to the page.  {self.title}, page {self._pages}"
         )
-        self.text(self.margin, y - 1.5, told, 2.0)
+        self.text(self.margin, y - 1.5, message, 2.0)
         canvas.showPage()
 
     def content(self) -> bytes:

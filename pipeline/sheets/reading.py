@@ -38,7 +38,7 @@ def read_targets(folder: Path, out: Path, body: Path | None) -> dict[str, Any]:
     ----------
     body : what is to be seen; None: ring12 codes and dots, bright or dark, whichever there is more of.
     """
-    images = list_images(folder, "the images")
+    images = list_images(folder, "--images")
     if out.resolve() == folder.resolve():
         raise InvalidInput(f"{out}: the pictures would lie among the images: name another folder for --out")
     try:

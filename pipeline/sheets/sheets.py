@@ -91,8 +91,10 @@ def _quiet_zone(board: Board) -> float:
 
 def _words(board: Board) -> str:
     sizes = [(n, getattr(board, n)) for n in ("square", "marker", "spacing", "diameter")]
-    told = ", ".join(f"{name} {1000 * value:g} mm" for name, value in sizes if value is not None)
-    return f"{board.kind} {board.columns} x {board.rows}, {told}{', ' + board.dictionary if board.dictionary else ''}"
+    message = ", ".join(f"{name} {1000 * value:g} mm" for name, value in sizes if value is not None)
+    return (
+        f"{board.kind} {board.columns} x {board.rows}, {message}{', ' + board.dictionary if board.dictionary else ''}"
+    )
 
 
 def _fitting(entry: SheetEntry, title: str, config: Path, needed: Array, what: str) -> Sheet:

@@ -80,8 +80,8 @@ def _detect(job: _Job) -> ImageEntry:
             else:
                 found = find_board(read_image(job.path), job.board, job.settings.polarity)
         except RobcalError as error:
-            told = str(error) if str(job.path) in str(error) else f"{job.path}: {error}"
-            return ImageEntry(job.source, job.name, job.path, None, (0, 0), 0, 0, 0, told)
+            reported = str(error) if str(job.path) in str(error) else f"{job.path}: {error}"
+            return ImageEntry(job.source, job.name, job.path, None, (0, 0), 0, 0, 0, reported)
         codec.save(path, found)
     height, width = found.shape
     read = int((found.code >= 0).sum())

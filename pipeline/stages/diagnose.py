@@ -33,12 +33,12 @@ def work(context: Context) -> Outcome:
     """Diagnose the images, then the identified robot; verification poses only measure the gain."""
     campaign, run = context.campaign, context.run
     images = findings_of(campaign, run)
-    if campaign.robot is None or campaign.poses is None:
+    if campaign.robot is None or campaign.poses is None or campaign.robot.is_hexapod:
         content = with_images(None, images.findings, images.scans, images.noise)
         write_json(run.diagnosis, content)
-        told = [str(finding.statement) for finding in images.findings] or [str(content["statement"])]
+        reported = [str(finding.statement) for finding in images.findings] or [str(content["statement"])]
         result = {"mismatch": content["mismatch"], "p_value": content["p_value"], "causes": _named(images.findings)}
-        return Outcome({"diagnosis": result | {"heldout_px": content["heldout_px"]}}, [run.diagnosis], told)
+        return Outcome({"diagnosis": result | {"heldout_px": content["heldout_px"]}}, [run.diagnosis], reported)
     if campaign.instruments:
         return diagnose_several(context, settings_of(campaign))
     station = run.find(artifacts.ORIENTATION)  # None where another system measured
@@ -67,9 +67,11 @@ def work(context: Context) -> Outcome:
         write_table(run.next_poses, _columns(content["next_poses"]))
         outputs.append(run.next_poses)
     outputs += _optional(run, found)
-    told = [f.statement for f in images.findings] + [f.told for f in diagnosis.findings]
-    told = [f"targets {x.targets[0]} and {x.targets[1]} exchanged in {len(x.poses)} pose(s)" for x in exchanges] + told
-    notes = told or ["nothing missing: the model explains the data"]
+    reported = [f.statement for f in images.findings] + [f.full_statement for f in diagnosis.findings]
+    reported = [
+        f"targets {x.targets[0]} and {x.targets[1]} exchanged in {len(x.poses)} pose(s)" for x in exchanges
+    ] + reported
+    notes = reported or ["nothing missing: the model explains the data"]
     if diagnosis.findings:
         notes = [*notes, found.in_force.reason]
     outcome = _result(diagnosis) | {key: content[key] for key in ("mismatch", "p_value", "heldout_mm")}
@@ -133,7 +135,9 @@ def _result(diagnosis: Diagnosis) -> dict[str, Any]:
 STAGE = Stage(
     name=NAME,
     applies=lambda campaign: (
-        campaign.entry.diagnosis.enabled and (campaign.measures_robot or campaign.entry.hand_eye is None)
+        campaign.entry.diagnosis.enabled
+        and (campaign.measures_robot or campaign.entry.hand_eye is None)
+        and not (campaign.robot is not None and campaign.robot.is_hexapod and campaign.entry.station is None)
     ),
     work=work,
     inputs=no_files,

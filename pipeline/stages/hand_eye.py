@@ -198,10 +198,10 @@ def _outcome(campaign: Campaign, run: Run, kept: HandEyeRun, notes: list[str]) -
         "causes": [{"cause": c["cause"], "where": c["where"], "parameters": c["parameters"]} for c in causes],
         "converged": found.summary.converged,
     }
-    told = [*notes, *(f"image '{r['image']}' is left out: {r['reason']}" for r in rejected), *found.notes]
-    told += [str(c["statement"]) for c in causes] + _shape_notes(found)
+    message = [*notes, *(f"image '{r['image']}' is left out: {r['reason']}" for r in rejected), *found.notes]
+    message += [str(c["statement"]) for c in causes] + _shape_notes(found)
     if not found.summary.converged:
-        told.append(f"the adjustment did not converge: {found.summary.termination}")
+        message.append(f"the adjustment did not converge: {found.summary.termination}")
     whole: dict[str, Any] = {NAME: result}
     if not campaign.measures_robot:
         outputs += _diagnosis(campaign, run, causes, found)
@@ -209,7 +209,7 @@ def _outcome(campaign: Campaign, run: Run, kept: HandEyeRun, notes: list[str]) -
         if kept.robot is not None:
             write_robot(run.robot, kept.robot.model, f"from the hand-eye calibration of campaign {campaign.name}")
             outputs.append(run.robot)
-    return Outcome(whole, outputs, told)
+    return Outcome(whole, outputs, message)
 
 
 def _noise(kept: HandEyeRun) -> dict[str, float]:
@@ -255,12 +255,12 @@ def _diagnosis(campaign: Campaign, run: Run, causes: list[dict[str, object]], fo
     if causes:
         first = causes[0]
         statement = f"{first['statement']}."
-        told = statement if not images.findings else f"{content['statement']} {statement}"
+        message = statement if not images.findings else f"{content['statement']} {statement}"
         listed = content["causes"]
         content = content | {
             "mismatch": True,
             "p_value": 0.0,
-            "statement": told,
+            "statement": message,
             "location": {"stage": first["stage"], "where": first["where"], "direction": None, "poses": []},
             "causes": [*causes, *(listed if isinstance(listed, list) else [])],
         }

@@ -182,6 +182,11 @@ def _notes(found: IdentifiedRobot, poses: Poses, rows: Rows) -> list[str]:
     for i in found.outliers:
         name, error = poses.names[int(rows[i])], found.normalised[i]
         notes.append(f"pose '{name}' contradicts all others and was left out (normalised error {error:.1f})")
+    if found.model.is_hexapod:
+        notes.append(
+            "a Stewart platform: no missing physics is looked for (the causes are those of chains); whether the model "
+            f"suffices shows in sigma0 = {found.sigma0:.2f} (p = {found.p_value:.2g})"
+        )
     if not found.summary.converged:
         notes.append(f"the identification did not converge: {found.summary.termination}")
     return notes

@@ -21,7 +21,7 @@ from robcal.files.measurement_tables import MeasuredTable
 from robcal.files.recordings import observations_of
 from robcal.photogrammetry.core.bodies import Body
 from robcal.recipe.wires import Correction
-from robcal.robot.chain import chain_of, forward
+from robcal.robot.hexapod import nominal_frames
 from robcal.transforms import Array
 
 
@@ -70,7 +70,7 @@ def _closed_loops(campaign: Campaign, name: str, source: InstrumentSource) -> li
         for k, (loop, kind) in enumerate(t.loops.items())
         if len(rows := np.flatnonzero(t.loop == k))
     ]
-    flange = forward(chain_of(robot), poses.q)
+    flange = nominal_frames(robot, poses.q)
     try:
         placed = start_of_loops([(kind, flange[o.pose]) for _, o, kind in loops], source.tool)
     except DegenerateGeometry as error:

@@ -131,10 +131,10 @@ def _usable(
         if name not in used:
             why = next((reason for camera, _, reason in problems if camera == name), "no targets found")
             folder = next(iter(source.images.values())).parent if source.images else name
-            told = f"{folder}: no target of body '{body.name}' identified in any image of camera '{name}': {why}"
+            message = f"{folder}: no target of body '{body.name}' identified in any image of camera '{name}': {why}"
             if not used:
-                raise InvalidInput(f"{told}: are these images of the body, and is it the right body file?")
-            notes.append(told)
+                raise InvalidInput(f"{message}: are these images of the body, and is it the right body file?")
+            notes.append(message)
     return used
 
 

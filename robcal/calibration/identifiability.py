@@ -16,7 +16,7 @@ from scipy import linalg, special
 from robcal.calibration.wire import LIMITS as WIRE_LIMITS
 from robcal.errors import InvalidInput, NotIdentifiable
 from robcal.robot.loops import FOUR_BAR_LENGTHS
-from robcal.robot.model import GEOMETRIC_KINDS, RobotModel, frame_kinds
+from robcal.robot.model import GEOMETRIC_KINDS, LENGTH_KINDS, RobotModel, frame_kinds, geometric_kinds
 from robcal.robot.statics import moment_names
 from robcal.robot.terms import identifier
 
@@ -83,7 +83,7 @@ def choose_candidates(model: RobotModel, parameters: str | Sequence[str]) -> Can
     """
     ends = [f"{end}.{k}" for end in ("base", "tool") for k in GEOMETRIC_KINDS]
     zeros = [f.zero_name for f in model.joints]
-    others = [f"{f.name}.{k}" for f in model.frames for k in GEOMETRIC_KINDS]
+    others = [f"{f.name}.{k}" for f in model.frames for k in geometric_kinds(f)]
     # of a four-bar only the ratios of its lengths show: the ground, which comes last, stays as constructed
     others += [f"{f.name}.{k}" for f in model.frames if f.fourbar is not None for k in CRANK_FIRST]
     others = [name for name in others if name not in zeros]
@@ -135,7 +135,7 @@ def limit_rules(model: RobotModel, names: Sequence[str]) -> tuple[Array, NDArray
             limits[k] = WIRE_LIMITS[kind]
         if frame not in frames:
             continue
-        if kind in ("x", "y", "z", *FOUR_BAR_LENGTHS):
+        if kind in LENGTH_KINDS:
             limits[k] = PLAUSIBLE_LENGTH
         elif kind in ("roll", "pitch", "yaw", "crank_angle"):
             limits[k] = PLAUSIBLE_ANGLE

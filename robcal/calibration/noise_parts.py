@@ -103,8 +103,8 @@ def noise_parts(
     pure = _within(residuals, np.column_stack([labels[pose], group]))
     repeats = int(len(np.unique(pose)) - len(np.unique(labels[pose])))
     lengths = length_scatter(observations)
-    told = float(np.sqrt(stated_square(observations))) / weighted if stated else None
-    measurement, source, notes = _measurement(told, pure, lengths, refuted=weighted != 1.0)
+    stated_rms = float(np.sqrt(stated_square(observations))) / weighted if stated else None
+    measurement, source, notes = _measurement(stated_rms, pure, lengths, refuted=weighted != 1.0)
     if source == "stated" and left < LARGE**2:
         measurement, source = measurement * float(np.sqrt(left)), "residuals"
         notes.append("the stated uncertainty is larger than what is left with all that was found: that figure counts")
@@ -113,33 +113,37 @@ def noise_parts(
     total = _Scatter(float(np.sum(residuals**2)) / freedom * dimension, freedom)
     if pure is None:
         lack = float(np.sqrt(max(0.0, total.square - measurement**2)))
-        return NoiseParts(measurement, source, told, None, lack, repeats, None, tuple(notes), dimension)
+        return NoiseParts(measurement, source, stated_rms, None, lack, repeats, None, tuple(notes), dimension)
     square = total.square * total.freedom - pure.square * pure.freedom
     beyond = _Scatter(max(0.0, square) / max(1, total.freedom - pure.freedom), max(1, total.freedom - pure.freedom))
     p = float(stats.f.sf(beyond.square / max(pure.square, 1e-300), beyond.freedom, pure.freedom))
     lack = float(np.sqrt(max(0.0, beyond.square - pure.square))) if p < LEVEL else 0.0
     scatter = float(np.sqrt(max(0.0, pure.square - measurement**2)) / lever) if lever > 0 else None
-    return NoiseParts(measurement, source, told, scatter, lack, repeats, p, tuple(notes), dimension)
+    return NoiseParts(measurement, source, stated_rms, scatter, lack, repeats, p, tuple(notes), dimension)
 
 
 def _measurement(
-    told: float | None, pure: _Scatter | None, lengths: float | None, *, refuted: bool = False
+    stated_rms: float | None, pure: _Scatter | None, lengths: float | None, *, refuted: bool = False
 ) -> tuple[float, Source, list[str]]:
     """The measurement's noise from the first source that holds: stated, repetitions, lengths on the body."""
     repeated = None if pure is None else float(np.sqrt(pure.square))
     notes = []
     # repetitions hold the joints' scatter as well: they refute a stated noise only from above
-    too_large = told is not None and repeated is not None and told > WRONG * repeated
+    too_large = stated_rms is not None and repeated is not None and stated_rms > WRONG * repeated
     wrong = (
-        refuted or too_large or (told is not None and lengths is not None and not 1 / WRONG < told / lengths < WRONG)
+        refuted
+        or too_large
+        or (stated_rms is not None and lengths is not None and not 1 / WRONG < stated_rms / lengths < WRONG)
     )
     for other, name in ((repeated, "exact repetitions"), (lengths, "lengths on the body")):
-        if told is None or other is None:
+        if stated_rms is None or other is None:
             continue
-        if told > DISAGREE * other or (name != "exact repetitions" and other > DISAGREE * told):
-            notes.append(f"the measurements state {1e3 * told:.3g} mm (RMS), {name} scatter by {1e3 * other:.3g} mm")
-    if told is not None and not wrong:
-        return told, "stated", notes
+        if stated_rms > DISAGREE * other or (name != "exact repetitions" and other > DISAGREE * stated_rms):
+            notes.append(
+                f"the measurements state {1e3 * stated_rms:.3g} mm (RMS), {name} scatter by {1e3 * other:.3g} mm"
+            )
+    if stated_rms is not None and not wrong:
+        return stated_rms, "stated", notes
     if wrong:
         notes.append("the stated uncertainty is far off and not believed")
     if repeated is not None and not (lengths is not None and lengths < repeated):

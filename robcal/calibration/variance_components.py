@@ -75,8 +75,8 @@ def believable(found: IdentifiedRobot, inputs: PoseInputs, recording: RobotRecor
         new if own is old else rescaled([own], [factor])[0]
         for own, old, new, factor in zip(recording.detailed, recording.observations, observations, points, strict=True)
     )
-    told = " and ".join(f"{np.sqrt(f):.2g}" for f in dict.fromkeys(float(v) for factor in factors for v in factor))
-    note = f"the stated uncertainties are contradicted: the weights have {told} times the stated sigmas"
+    message = " and ".join(f"{np.sqrt(f):.2g}" for f in dict.fromkeys(float(v) for factor in factors for v in factor))
+    note = f"the stated uncertainties are contradicted: the weights have {message} times the stated sigmas"
     return replace(
         recording,
         observations=observations,

@@ -223,12 +223,12 @@ def _distinguishable(
     limits = np.array([np.inf if k < 12 else WEAKEST for k in wanted])
     kept, gone = split_dependent(N, names, limits)
     size = dict(zip(names, np.sqrt(np.diag(N)), strict=True))
-    told = []
+    reported = []
     for e in gone:
         shares = {name: abs(value) * size[name] for name, value in e.tied_to.items()}
         strong = [name for name, share in shares.items() if share > STRONG_TIE * max(shares.values())]
-        told.append((e, [name.replace(".", " ") for name in strong]))
-    return wanted[kept], told
+        reported.append((e, [name.replace(".", " ") for name in strong]))
+    return wanted[kept], reported
 
 
 @dataclass(frozen=True)

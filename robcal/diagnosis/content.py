@@ -85,7 +85,7 @@ def cause_content(finding: Finding) -> dict[str, object]:
         "heldout_mm": {"before": number(finding.heldout[0] * 1e3), "after": number(finding.heldout[1] * 1e3)},
         "in_force": not finding.waits,
         "in_force_reason": finding.waits,
-        "statement": finding.told,
+        "statement": finding.full_statement,
     }
 
 
@@ -245,9 +245,9 @@ def _with_gain(finding: Finding, count: int) -> str:
     """A statement with its share of the gain of all causes, or that poses kept out get no better by it."""
     before, after = finding.heldout
     if after >= before:
-        return f"{finding.told}; poses kept out get no better by it"
+        return f"{finding.full_statement}; poses kept out get no better by it"
     share = f"; it is {finding.explained:.0%} of what all causes gain" if count > 1 else ""
-    return f"{finding.told}{share}"
+    return f"{finding.full_statement}{share}"
 
 
 def number(value: object) -> object:

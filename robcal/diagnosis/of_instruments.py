@@ -31,7 +31,7 @@ def instruments_content(
     ``heldout_mm`` : error at kept-out poses before and after, of the instrument that verifies.
     """
     content = diagnosis_content(own[leading])
-    told = [_cause(c) for c in causes]
+    reported = [_cause(c) for c in causes]
     first = causes[0].finding if causes else None
     location = None
     if first is not None:
@@ -51,7 +51,7 @@ def instruments_content(
         "p_value": number(min(d.p_value for d in own.values())),
         "statement": "; ".join(c.statement for c in causes) or "Nothing is missing: the model explains all instruments",
         "location": location,
-        "causes": told,
+        "causes": reported,
         "heldout_mm": gain,
         "unexplained": diagnosis_content(left)["unexplained"],
         "instruments": {name: _of_one(name, d, causes) for name, d in own.items()},

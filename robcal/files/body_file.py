@@ -136,8 +136,8 @@ def _ring(entry: BodyEntry, document: YamlDocument) -> RingPattern:
     """The pattern of a body's ring codes, of one number of segments."""
     kinds = sorted({n for t in entry.targets or () if (n := ring_segments(t.code)) is not None})
     if len(kinds) > 1:
-        told = ", ".join(f"ring{n}" for n in kinds)
-        raise InvalidInput(f"{document.path}: ring codes of several kinds on one body ({told}): use one")
+        message = ", ".join(f"ring{n}" for n in kinds)
+        raise InvalidInput(f"{document.path}: ring codes of several kinds on one body ({message}): use one")
     use = entry.ring or RingEntry()
     try:
         segments = kinds[0] if kinds else RING12.segments

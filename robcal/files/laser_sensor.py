@@ -111,12 +111,12 @@ def sensed_points(
     target = target_ids(table)
     table.unique(["pose", "target", *(["cycle"] if table.has("cycle") else [])])
     names, ranges = READINGS[sensor.kind], sensor.ranges.tolist()
-    told = ", ".join(f"{n} {low:g} to {high:g}" for n, (low, high) in zip(names, ranges, strict=True))
+    message = ", ".join(f"{n} {low:g} to {high:g}" for n, (low, high) in zip(names, ranges, strict=True))
     table.refuse(
         sensor.outside(readings),
         lambda i: (
             f"the reading ({', '.join(f'{n} = {v:g}' for n, v in zip(names, readings[i], strict=True))}) lies beyond "
-            f"those of the sensor's calibration ({told}): check the units, or calibrate over the whole range"
+            f"those of the sensor's calibration ({message}): check the units, or calibrate over the whole range"
         ),
     )
     p, noise, J = sensor.points(readings)

@@ -10,7 +10,7 @@ from pydantic import Field
 
 from robcal.errors import InvalidInput
 from robcal.files.measurement_tables import MeasuredTable, SharedErrors, few, point_covariance, pose_index, target_ids
-from robcal.files.robot_file import PlacementEntry, placement_data
+from robcal.files.placement import PlacementEntry, placement_data
 from robcal.files.schemas import Entry, Number, Positive, Text, proposal, read_entry
 from robcal.files.storage import write_text
 from robcal.files.tables import Table, read_table

@@ -12,6 +12,7 @@ from robcal.calibration.joint_log import JointLog, approach_from_order
 from robcal.errors import InvalidInput
 from robcal.files.schemas import proposal, shown
 from robcal.files.tables import Table, read_table
+from robcal.robot.hexapod import legs_of
 from robcal.robot.loops import closing
 from robcal.robot.model import RobotModel
 from robcal.transforms import Array
@@ -22,6 +23,7 @@ LONGEST_STEP = 3600.0
 """Time (s) from one pose to the next that no recording takes as a rule."""
 _HEADING = re.compile(r"(?:q|a|j|ax|axis|joint|e)[ _.]?\d{1,2}(?:[ _]?[\[(]?(?:deg|rad|mm|m|°)?[\])]?)")
 """Headings that controllers and other programs give to joints."""
+_COLUMN = re.compile(r"q\d+_(deg|mm)|l\d+_mm")
 NO_PAYLOAD = frozenset({"", "none", "-", "0"})
 
 
@@ -43,7 +45,9 @@ class Poses(JointLog):
 
 
 def joint_columns(robot: RobotModel) -> list[tuple[str, float]]:
-    """Column name and factor to SI of each joint."""
+    """Column name and factor to SI of each joint, or of each leg of a Stewart platform."""
+    if robot.is_hexapod:
+        return [(f"l{k}_mm", 1e-3) for k in range(1, 7)]
     return [
         (f"q{k}_mm", 1e-3) if joint.prismatic else (f"q{k}_deg", np.pi / 180)
         for k, joint in enumerate(robot.joints, start=1)
@@ -79,6 +83,9 @@ def poses_of(table: Table, robot: RobotModel | None, payloads: Collection[str], 
     _check_joint_columns(table, [name for name, _ in joints])
     q = np.column_stack([table.numbers(name) * factor for name, factor in joints])
     _refuse_open_loops(table, robot, q)
+    if robot.is_hexapod:
+        found = legs_of(robot).forward(q)[1]
+        table.refuse(~found, lambda i: f"no position of the platform has these leg lengths ({_lengths(q[i])} mm)")
     notes: list[str] = []
     approach, inferred = _approach(table, q, to_predict, notes)
     known = {"pose", "payload", "set", "target", "turn_deg", *(name for name, _ in joints)}
@@ -106,7 +113,7 @@ def check_rows(table: Table, payloads: Collection[str] | None) -> None:
     FaultyRows : a joint angle is no number, a load or a set is not known.
     """
     for name in table.columns:
-        if re.fullmatch(r"q\d+_(deg|mm)", name):
+        if _COLUMN.fullmatch(name):
             table.numbers(name)
     _verify(table)
     if payloads is not None:
@@ -126,9 +133,10 @@ def _check_joint_columns(table: Table, wanted: list[str]) -> None:
             column for column in table.columns if _HEADING.fullmatch(column.lower()) and _joint_number(column) == k
         ]
         if alike:
+            how = "the leg's length in mm" if name.startswith("l") else "the angle in degrees (a sliding joint in mm)"
             faults.append(
-                f"{table.path}, row 1: joint column '{alike[0]}' must be '{name}': state the angle in degrees (a "
-                "sliding joint in mm) and name the column so, or map it in campaign.yaml with 'poses: {file: "
+                f"{table.path}, row 1: joint column '{alike[0]}' must be '{name}': state {how} and name the "
+                "column so, or map it in campaign.yaml with 'poses: {file: "
                 f"{table.path.name}, columns: {{{name}: {alike[0]}}}}}'"
             )
         else:
@@ -136,7 +144,7 @@ def _check_joint_columns(table: Table, wanted: list[str]) -> None:
             faults.append(f"{table.path}, row 1: column '{name}' is missing{proposal(name, have)}: needed are {name}")
     if faults:
         raise InvalidInput(faults[0], faults)
-    beyond = [c for c in table.columns if re.fullmatch(r"q\d+_(deg|mm)", c) and c not in wanted]
+    beyond = [c for c in table.columns if _COLUMN.fullmatch(c) and c not in wanted]
     if beyond:
         raise InvalidInput(
             f"{table.path}, row 1: column '{beyond[0]}' has no joint: the robot has {len(wanted)} joints "
@@ -157,6 +165,10 @@ def _refuse_open_loops(table: Table, robot: RobotModel, q: Array) -> None:
             )
 
         table.refuse((np.abs(closing(bar.lengths, phi)) > 1.0).tolist(), sentence)
+
+
+def _lengths(row: Array) -> str:
+    return ", ".join(f"{1e3 * v:.3f}" for v in row)
 
 
 def _outside(table: Table, robot: RobotModel, q: Array) -> str:
@@ -212,8 +224,9 @@ def _verify(table: Table) -> NDArray[np.bool_]:
 def _approach(table: Table, q: Array, to_predict: bool, notes: list[str]) -> tuple[Array, tuple[int, ...]]:
     columns = [f"approach{k}" for k in range(1, q.shape[1] + 1)]
     given = [name in table.columns for name in columns]
-    if to_predict:
+    if to_predict or (table.has("l1_mm") and not any(given)):  # a leg's direction of approach is of no use so far
         approach = np.zeros_like(q)
+        to_predict = True
     else:
         approach = approach_from_order(q)
         if not all(given):

@@ -1,4 +1,4 @@
-"""robot.yaml (format robcal/robot-1): nominal and calibrated robots, read and written without loss.
+"""robot.yaml (format robcal/robot-1 or robcal/hexapod-1): nominal and calibrated robots, read and written without loss.
 
 Beside the contract's keys a calibrated robot may hold ``terms`` (extra physical terms found by the diagnosis),
 ``payloads`` and the reference frames ``world_T_base`` and ``flange_T_tool``.
@@ -7,59 +7,23 @@ Beside the contract's keys a calibrated robot may hold ``terms`` (extra physical
 import math
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
-import numpy as np
-from pydantic import BeforeValidator, Field
+from pydantic import Field
 
 from robcal.errors import InvalidInput
-from robcal.files.robot_frames import FrameEntry, chain_frames, frame_data, frame_faults, listed, metres
-from robcal.files.schemas import Entry, NotNegative, Number, Text, Triple, proposal, read_entry
+from robcal.files.hexapod_file import FORMAT as HEXAPOD
+from robcal.files.hexapod_file import HexapodEntry, hexapod_data, hexapod_faults, hexapod_of
+from robcal.files.placement import PayloadEntry, Placement, payload_data, placement_data
+from robcal.files.robot_frames import FrameEntry, chain_frames, frame_data, frame_faults
+from robcal.files.schemas import Entry, Number, Text, Triple, parse, proposal
 from robcal.files.storage import write_text
-from robcal.files.yaml_io import FlowMapping, YamlDocument, yaml_text
+from robcal.files.yaml_io import YamlDocument, read_yaml, yaml_text
 from robcal.robot.loops import FOUR_BAR_KINDS
-from robcal.robot.model import RESERVED_FRAME_NAMES, Payload, RobotModel, Term
-from robcal.transforms import Array, frame_from_xyzrpy, xyzrpy_from_frame
+from robcal.robot.model import RESERVED_FRAME_NAMES, RobotModel, Term
 
 FORMAT = "robcal/robot-1"
 STANDARD_GRAVITY = (0.0, 0.0, -9.80665)
-
-
-def _six(value: Any) -> Any:
-    if isinstance(value, list) and len(value) == 6:
-        return {"xyz_mm": value[:3], "rpy_deg": value[3:]}
-    return value
-
-
-class PlacementEntry(Entry):
-    """A frame in a file: millimetres and degrees."""
-
-    xyz_mm: Triple = (0.0, 0.0, 0.0)
-    rpy_deg: Triple = (0.0, 0.0, 0.0)
-
-    def matrix(self) -> Array:
-        """The 4x4 frame in metres."""
-        return frame_from_xyzrpy([v / 1000 for v in self.xyz_mm] + [math.radians(v) for v in self.rpy_deg])
-
-
-Placement = Annotated[PlacementEntry, BeforeValidator(_six)]
-
-
-def placement_data(a_T_b: Array) -> FlowMapping:
-    """A frame as the mapping that stands in files."""
-    six = xyzrpy_from_frame(a_T_b)
-    return FlowMapping(xyz_mm=listed(six[:3] * 1000), rpy_deg=listed(np.degrees(six[3:])))
-
-
-class PayloadEntry(Entry):
-    """A load on the flange, in flange coordinates."""
-
-    mass_kg: NotNegative
-    cog_mm: Triple = (0.0, 0.0, 0.0)
-
-    def payload(self) -> Payload:
-        """The load in SI units."""
-        return Payload(mass=self.mass_kg, cog=metres(self.cog_mm))
 
 
 class TermEntry(Entry):
@@ -91,13 +55,20 @@ class RobotEntry(Entry):
 
 
 def read_robot(path: Path | str) -> RobotModel:
-    """Read a robot.
+    """Read a robot: a chain (robcal/robot-1) or a Stewart platform (robcal/hexapod-1).
 
     Raises
     ------
     InvalidInput : the file contradicts the contract; the message names line and remedy.
     """
-    entry, document = read_entry(Path(path), RobotEntry, FORMAT)
+    document = read_yaml(Path(path))
+    if document.data.get("format") == HEXAPOD:
+        platform = parse(document, HexapodEntry, HEXAPOD)
+        faults = list(hexapod_faults(platform, document))
+        if faults:
+            raise InvalidInput(faults[0], faults)
+        return hexapod_of(platform)
+    entry = parse(document, RobotEntry, FORMAT)
     faults = list(_faults(entry, document))
     if faults:
         raise InvalidInput(faults[0], faults)
@@ -174,6 +145,8 @@ def _parameter_faults(
 
 def robot_data(model: RobotModel) -> dict[str, Any]:
     """The file's content as plain data."""
+    if model.is_hexapod:
+        return hexapod_data(model)
     data: dict[str, Any] = {"format": FORMAT, "name": model.name, "gravity_m_s2": [float(v) for v in model.gravity]}
     if model.gravity_frame != "base":
         data["gravity_frame"] = model.gravity_frame
@@ -182,10 +155,7 @@ def robot_data(model: RobotModel) -> dict[str, Any]:
     if model.terms:
         data["terms"] = [_term_data(term) for term in model.terms]
     if model.payloads:
-        data["payloads"] = {
-            name: FlowMapping(mass_kg=float(load.mass), cog_mm=listed(np.asarray(load.cog) * 1000))
-            for name, load in model.payloads.items()
-        }
+        data["payloads"] = payload_data(model.payloads)
     if model.world_T_base is not None:
         data["world_T_base"] = placement_data(model.world_T_base)
     if model.flange_T_tool is not None:

@@ -102,8 +102,8 @@ class Entry(BaseModel):
         known = _names(cls)
         for key in data:
             if key not in known:
-                told = f"unknown key '{key}'{proposal(str(key), known)}"
-                context = {"told": told, "key": str(key), "meant": nearest(str(key), known) or ""}
+                message = f"unknown key '{key}'{proposal(str(key), known)}"
+                context = {"told": message, "key": str(key), "meant": nearest(str(key), known) or ""}
                 raise PydanticCustomError("unknown_key", "{told}", context)
         return data
 
@@ -155,8 +155,8 @@ def parse_leniently(document: YamlDocument, schema: type[E], file_format: str) -
     data = copy.deepcopy(document.data)
     found = data.get("format")
     if found != file_format:
-        told = "is missing" if found is None else f"is {shown(found)}"
-        return None, [f"{document.path}: 'format' {told}, this must be a file of the format '{file_format}'"]
+        message = "is missing" if found is None else f"is {shown(found)}"
+        return None, [f"{document.path}: 'format' {message}, this must be a file of the format '{file_format}'"]
     for _ in range(MOST_ROUNDS):
         try:
             return schema.model_validate(data), faults
@@ -227,15 +227,15 @@ def _sentence(document: YamlDocument, problem: ErrorDetails, place: Place) -> st
     line = document.line(place if key is None else (*place, key))
     where = f"{document.path}, line {line}" if line else f"{document.path}"
     name = _dotted(place)
-    told = problem["msg"].removeprefix("Value error, ")
+    message = problem["msg"].removeprefix("Value error, ")
     if problem["type"] == "missing":
         missing = str(problem["loc"][-1])
-        told = f"the entry '{missing}' is missing"
+        message = f"the entry '{missing}' is missing"
     elif problem["type"] in {"tuple_type", "list_type", "dict_type"} or problem["type"].startswith("too_"):
-        told = f"{told[0].lower()}{told[1:]}, found {shown(problem['input'])}"
+        message = f"{message[0].lower()}{message[1:]}, found {shown(problem['input'])}"
     elif problem["type"] == "literal_error":
-        told = f"must be {problem['ctx']['expected']}, found {shown(problem['input'])}"
-    return f"{where}: {name + ': ' if name else ''}{told}"
+        message = f"must be {problem['ctx']['expected']}, found {shown(problem['input'])}"
+    return f"{where}: {name + ': ' if name else ''}{message}"
 
 
 def _place(location: Place, document: YamlDocument) -> Place:

@@ -105,11 +105,11 @@ def _start(data: HandEyeData, single: SingleImages, kept_out: BoolArray) -> Star
         better = float(np.quantile(start_values(swapped, data.camera, hidden, other).image_px, 0.3))
     except NotIdentifiable:
         better = np.inf
-    told = f"no camera and board agree with the poses: most images miss by more than {wrong:.0f} px"
+    message = f"no camera and board agree with the poses: most images miss by more than {wrong:.0f} px"
     if better < 0.2 * wrong:
-        raise InvalidInput(f"{told}, but with 'mounted: {turned}' by {better:.1f} px: state that")
+        raise InvalidInput(f"{message}, but with 'mounted: {turned}' by {better:.1f} px: state that")
     raise InvalidInput(
-        f"{told}: do the images belong to these poses, do the joint angles belong to this robot file, are the "
+        f"{message}: do the images belong to these poses, do the joint angles belong to this robot file, are the "
         "board's kind, columns, rows and sizes right?"
     )
 

@@ -77,8 +77,8 @@ def _cause(placed: Sequence[Placed], angles: Array, bumps: int, where: str, sent
         values = np.sum([x * b.value({f"q{first.joint.number}": angles}) for b, x in zip(own, v, strict=True)], axis=0)
         formula = " + ".join(f"{x:.6g}*({b.expression})" for b, x in zip(own, v, strict=True))
         term = {"variables": [f"q{first.joint.number}_deg"], "kind": "gaussian_process", "formula": formula}
-        told: dict[str, object] = {"term": term, "period_deg": 360.0, "rms_deg": float(np.degrees(np.std(values)))}
-        return told | (_mounting(placed) if len(placed) > 1 else {})
+        reported: dict[str, object] = {"term": term, "period_deg": 360.0, "rms_deg": float(np.degrees(np.std(values)))}
+        return reported | (_mounting(placed) if len(placed) > 1 else {})
 
     return RobotCause(
         ANGLE_ERROR_CURVE,

@@ -114,7 +114,7 @@ def _motions(source: Source, sections: _Sections) -> tuple[list[Use], dict[str, 
             if re.match(r"\s*P\[[^\]]*\]\s*=", body):
                 uses.append(_refused(place, "a position is changed while the program runs"))
             continue
-        reason = next((told for pattern, told in _REFUSED if re.search(pattern, body)), None)
+        reason = next((reported for pattern, reported in _REFUSED if re.search(pattern, body)), None)
         if reason is not None:
             uses.append(_refused(place, reason))
             continue

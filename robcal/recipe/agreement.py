@@ -32,17 +32,17 @@ def disagreements(
     ----------
     found : verification of the delivered ``robot``. diagnosis : content of diagnosis.json.
     """
-    told = found.delivered.tools["0"].rms
+    reported = found.delivered.tools["0"].rms
     out = []
     if found.delivered.kind == "verify-set" and not found.at_home:
         T, _ = robot.predict(robot.inputs(log.as_stated()).subset(found.rows))
         miss = float(np.sqrt(np.mean(tool_errors(T, recording.select(found.rows))["0"][1] ** 2)))
-        out += _unequal("the delivered error", told, "what predict gives", miss)
+        out += _unequal("the delivered error", reported, "what predict gives", miss)
     if not diagnosis or diagnosis.get("heldout_mm") is None:
         return out
     after = diagnosis["heldout_mm"].get("after")
     if after is not None:
-        out += _unequal("the diagnosis' error afterwards", 1e-3 * after, "the verification's", told)
+        out += _unequal("the diagnosis' error afterwards", 1e-3 * after, "the verification's", reported)
     if "in_force" in diagnosis:
         out += _in_force(diagnosis, robot)
     return out

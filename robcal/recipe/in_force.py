@@ -156,8 +156,8 @@ def choose(recording: Recording, log: JointLog, rows: Rows, bare: Form, extended
     chosen, reasons, measuring = _beside_faults(folds, bare, extended.direct)
     waits: dict[str, str] = {}
     if groups := groups_of(bare, extended):
-        chosen, told, waits = with_terms(folds, chosen, replace(extended, direct=chosen.direct), groups)
-        reasons += told
+        chosen, message, waits = with_terms(folds, chosen, replace(extended, direct=chosen.direct), groups)
+        reasons += message
     whole, _ = folds.gain(bare, chosen, log.as_stated(), freed=False)
     reason = "; ".join(reasons) + ("" if chosen is not bare else "; the identified robot is delivered")
     return InForce(chosen, chosen is not bare, whole.before, whole.after, reason, waits, measuring)
@@ -179,7 +179,7 @@ def _beside_faults(folds: Folds, bare: Form, direct: Sequence[Accepted]) -> tupl
         found, _ = folds.gain(bare, beside, stated)
     why = list(reasons)
     if beside.direct:
-        reasons.append(_told("faults of the measuring", found, found.clear, found))
+        reasons.append(_gain_statement("faults of the measuring", found, found.clear, found))
         why += [] if found.clear else reasons[-1:]
     return beside if beside.direct and found.clear else bare, reasons, "; ".join(why)
 
@@ -193,12 +193,12 @@ def with_terms(folds: Judge, base: Form, full: Form, groups: Groups) -> tuple[Fo
         trial = full.without([name for group in unpaid for name in groups[group]])
         found, weighted = folds.gain(base, trial, stated)
         pays = found.pays_beside(weighted)
-        reasons.append(_told("terms of the robot", found, pays, weighted))
+        reasons.append(_gain_statement("terms of the robot", found, pays, weighted))
         part, unpaid = (trial, unpaid) if pays else (base, dict.fromkeys(groups, found))
     waits: dict[str, str] = {}
     if unpaid and folds.log.inferred:
-        part, told, waits = _with_approach(folds, part, full, groups, unpaid)
-        reasons += told
+        part, message, waits = _with_approach(folds, part, full, groups, unpaid)
+        reasons += message
     unpaid = {group: gain for group, gain in unpaid.items() if not set(groups[group]) <= set(part.free)}
     left = [group for group in unpaid if group not in waits]
     if left:
@@ -220,12 +220,12 @@ def _with_approach(
     found, weighted = folds.gain(part, trial, folds.log)
     if not found.pays_beside(weighted):
         return part, [], {}
-    told = f"with approach directions stated the error over blocked folds is {_errors(found, 'them')}"
+    message = f"with approach directions stated the error over blocked folds is {_errors(found, 'them')}"
     cost, _ = folds.gain(part, trial, folds.log.as_stated())
     if cost.even and cost.after <= WAITING * cost.before:
-        return trial, [f"{', '.join(waiting)} pay: {told}"], {}
-    why = f"waits for approach directions: {told}, without directions {_errors(cost, 'them')}"
-    return part, [f"state approach: {', '.join(waiting)}: {told}"], dict.fromkeys(waiting, why)
+        return trial, [f"{', '.join(waiting)} pay: {message}"], {}
+    why = f"waits for approach directions: {message}, without directions {_errors(cost, 'them')}"
+    return part, [f"state approach: {', '.join(waiting)}: {message}"], dict.fromkeys(waiting, why)
 
 
 def _is_move(item: Accepted) -> bool:
@@ -283,7 +283,7 @@ def _errors(found: Gain, what: str) -> str:
     return f"{1e3 * found.before:.3g} mm without, {1e3 * found.after:.3g} mm with {what}"
 
 
-def _told(what: str, found: Gain, accepted: bool, weighted: Gain) -> str:
+def _gain_statement(what: str, found: Gain, accepted: bool, weighted: Gain) -> str:
     errors = _errors(found, "them")
     if accepted and not found.pays:
         return (

@@ -50,8 +50,8 @@ def identify_from_instruments(
         if slips and start is model:
             start = model.with_parameters({**model.parameters, **slips[0].values})
             notes.append(f"{slips[0].statement}; {slips[0].remedy}")
-    instruments, told = with_told_orientations(Kernel(start), log, instruments)
-    notes += told
+    instruments, reported = with_determined_orientations(Kernel(start), log, instruments)
+    notes += reported
     found = identify_instruments(start, log, instruments, options)
     found = replace(found, notes=(*found.notes, *wire_alarms(start, found, log, options)))
     unstated = [i.name for i in instruments if not i.recording.stated]
@@ -60,7 +60,7 @@ def identify_from_instruments(
     return replace(found, notes=(*notes, *found.notes))
 
 
-def with_told_orientations(
+def with_determined_orientations(
     kernel: Kernel, log: JointLog, instruments: Sequence[Instrument]
 ) -> tuple[list[Instrument], list[str]]:
     """Instruments of which the orientation of a certificate is freed where the points tell it better; a note each.
@@ -76,12 +76,14 @@ def with_told_orientations(
         free = i.tool.with_free_angles()
         part = Part(i.name, log.inputs(kernel).subset(rows), i.recording.select(rows), i.world, free)
         at = place(part, kernel.with_references(np.eye(4), np.eye(4)).frames(kernel.theta0, part.poses))
-        rows_told = sum(len(o.pose) * o.dimension for o in part.observations)
-        scale = max(1.0, 2.0 * at.cost / max(1, rows_told - 12))
+        rows_determined = sum(len(o.pose) * o.dimension for o in part.observations)
+        scale = max(1.0, 2.0 * at.cost / max(1, rows_determined - 12))
         sigma = np.sqrt(np.diag(at.covariance)[6:])
         tie = np.abs(at.covariance[6:9, 9:] / np.maximum(np.outer(sigma[:3], sigma[3:]), 1e-300)).max()
-        told = not any(h.startswith("flange_T_tool") for h in at.held) and np.sqrt(scale) * sigma[3:].max() < CARRIED
-        if told and tie < TIED:
+        determined = (
+            not any(h.startswith("flange_T_tool") for h in at.held) and np.sqrt(scale) * sigma[3:].max() < CARRIED
+        )
+        if determined and tie < TIED:
             out.append(replace(i, tool=free))
             notes.append(f"instrument '{i.name}': its points tell the orientation of the sensor, which is identified")
         else:

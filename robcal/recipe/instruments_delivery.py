@@ -25,7 +25,7 @@ NOT_CONFIRMED = "not confirmed on blocked folds, where poses are predicted no be
 
 
 @dataclass(frozen=True)
-class Told:
+class ReportedCause:
     """A cause, which instrument shows it, which others do, and which contradict it.
 
     ``of_instrument`` : it belongs to the instrument, not to the robot. by_priors : what is believed of the robot's
@@ -50,12 +50,12 @@ class Told:
             others = " and ".join(f"'{name}'" for name in self.contradicting)
             return (
                 f"instrument '{self.instrument}' shows what {others} contradicts, so it belongs to that instrument: "
-                f"{self.finding.told}"
+                f"{self.finding.full_statement}"
             )
         if self.of_instrument:
             why = "; else links would be off by more than they are believed to be" if self.by_priors else ""
-            return f"instrument '{self.instrument}': {self.finding.told}{why}"
-        return self.finding.told
+            return f"instrument '{self.instrument}': {self.finding.full_statement}{why}"
+        return self.finding.full_statement
 
 
 @dataclass(frozen=True)
@@ -64,24 +64,25 @@ class InstrumentsDiagnosis:
 
     Attributes
     ----------
-    own : the diagnosis of each instrument that was identified from. told : all causes, most significant first.
+    own : the diagnosis of each instrument that was identified from. reported : all causes, most significant first.
     found : the robot and all instruments identified anew beside those in force; the same object where none is.
-    start : the model with the causes of the robot, from which it was identified. not_told : what cannot be told.
+    start : the model with the causes of the robot, from which it was identified.
+    not_separable : what the measurements cannot separate.
     decided : which of the robot's terms pay over blocked folds, and why; None where nothing was found.
     """
 
     own: Mapping[str, Diagnosis]
-    told: tuple[Told, ...]
+    reported: tuple[ReportedCause, ...]
     found: IdentifiedInstruments = field(repr=False)
     start: RobotModel = field(repr=False)
-    not_told: tuple[str, ...] = ()
+    not_separable: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     decided: InForce | None = None
 
     @property
     def in_force(self) -> bool:
         """Whether anything that was found is in the robot that is delivered, or taken back from an instrument."""
-        return any(not t.finding.waits for t in self.told)
+        return any(not t.finding.waits for t in self.reported)
 
 
 @dataclass(frozen=True)
@@ -96,17 +97,19 @@ class Anew:
     corrections: Mapping[str, Correction]
     own: Mapping[str, Diagnosis]
 
-    def identified(self, told: Sequence[Told]) -> tuple[IdentifiedInstruments, RobotModel, IdentifyOptions]:
+    def identified(
+        self, reported: Sequence[ReportedCause]
+    ) -> tuple[IdentifiedInstruments, RobotModel, IdentifyOptions]:
         """All instruments together once more: the robot's causes as terms, wires' as parameters, others taken back."""
         options, start = self.options, self.model
-        for number, f in enumerate(_of_robot(told)):
+        for number, f in enumerate(_of_robot(reported)):
             if f.cause.free_parameters:
                 if not isinstance(options.parameters, str):
                     options = replace(options, parameters=(*options.parameters, *f.cause.free_parameters))
                 continue
             start = start.with_terms(terms_of(Accepted(f.cause, f.constants, f.values, f.covariance), number))
         freed = [
-            _beside(i, [t.finding for t in told if t.instrument == i.name], self.own.get(i.name), self.log)
+            _beside(i, [t.finding for t in reported if t.instrument == i.name], self.own.get(i.name), self.log)
             for i in self.instruments
         ]
         return identify_with_corrections(start, self.log, freed, self.corrections, options), start, options
@@ -124,44 +127,44 @@ class Anew:
         return notes
 
 
-def _of_robot(told: Sequence[Told]) -> list[Finding]:
-    return [t.finding for t in told if not t.of_instrument]
+def _of_robot(reported: Sequence[ReportedCause]) -> list[Finding]:
+    return [t.finding for t in reported if not t.of_instrument]
 
 
-def delivered(anew: Anew, told: Sequence[Told], not_told: tuple[str, ...]) -> InstrumentsDiagnosis:
+def delivered(anew: Anew, reported: Sequence[ReportedCause], not_separable: tuple[str, ...]) -> InstrumentsDiagnosis:
     """The robot with what pays over blocked folds; causes that these contradict become remarks."""
-    told, notes = list(told), []
-    while told:
-        again, start, options = anew.identified(told)
+    reported, notes = list(reported), []
+    while reported:
+        again, start, options = anew.identified(reported)
         # the law of a search is linear: what it needed beside the right cause the exact one does not
-        needless = [t for t in told if _is_needless(t, again)]
+        needless = [t for t in reported if _is_needless(t, again)]
         if not needless:
             folds = InstrumentFolds(start, again, anew.log, options)
-            groups = _groups(told, again)
+            groups = _groups(reported, again)
             weak = contradicted_groups(
-                folds, {k: names for k, names in groups.items() if names and not told[int(k)].by_priors}
+                folds, {k: names for k, names in groups.items() if names and not reported[int(k)].by_priors}
             )
-            needless = [told[int(k)] for k in weak]
+            needless = [reported[int(k)] for k in weak]
             notes += [f"{NOT_CONFIRMED}: {t.statement}" for t in needless]
         if needless:
-            told = [t for t in told if t not in needless]
+            reported = [t for t in reported if t not in needless]
             continue
-        added = [n for k, names in groups.items() if not told[int(k)].of_instrument for n in names]
+        added = [n for k, names in groups.items() if not reported[int(k)].of_instrument for n in names]
         decided = choose_among(folds, added)
-        told = [_waiting(t, groups[str(k)], decided.waits) for k, t in enumerate(told)]
-        stay = [t for t in told if not t.finding.waits]
-        if len(stay) < len(told):
+        reported = [_waiting(t, groups[str(k)], decided.waits) for k, t in enumerate(reported)]
+        stay = [t for t in reported if not t.finding.waits]
+        if len(stay) < len(reported):
             again, start, _ = anew.identified(stay) if stay else (anew.found, anew.model, options)
         notes = [*anew.notes(again), *notes]
-        return InstrumentsDiagnosis(anew.own, tuple(told), again, start, not_told, tuple(notes), decided)
-    return InstrumentsDiagnosis(anew.own, (), anew.found, anew.model, not_told, tuple(notes))
+        return InstrumentsDiagnosis(anew.own, tuple(reported), again, start, not_separable, tuple(notes), decided)
+    return InstrumentsDiagnosis(anew.own, (), anew.found, anew.model, not_separable, tuple(notes))
 
 
-def _groups(told: Sequence[Told], found: IdentifiedInstruments) -> dict[str, tuple[str, ...]]:
+def _groups(reported: Sequence[ReportedCause], found: IdentifiedInstruments) -> dict[str, tuple[str, ...]]:
     """Parameters by the number of each cause that it brought into the identification; none where it was taken back."""
     out: dict[str, tuple[str, ...]] = {}
     number = 0
-    for k, t in enumerate(told):
+    for k, t in enumerate(reported):
         f = t.finding
         names: tuple[str, ...] = ()
         if not t.of_instrument:
@@ -173,9 +176,9 @@ def _groups(told: Sequence[Told], found: IdentifiedInstruments) -> dict[str, tup
     return out
 
 
-def _waiting(told: Told, names: Sequence[str], waits: Mapping[str, str]) -> Told:
+def _waiting(reported: ReportedCause, names: Sequence[str], waits: Mapping[str, str]) -> ReportedCause:
     why = next((waits[n] for n in names if n in waits), "")
-    return replace(told, finding=replace(told.finding, waits=why)) if why else told
+    return replace(reported, finding=replace(reported.finding, waits=why)) if why else reported
 
 
 def _beside(instrument: Instrument, findings: Sequence[Finding], own: Diagnosis | None, log: JointLog) -> Instrument:
@@ -187,10 +190,10 @@ def _beside(instrument: Instrument, findings: Sequence[Finding], own: Diagnosis 
     return instrument if clean is None else replace(instrument, recording=clean)
 
 
-def _is_needless(told: Told, found: IdentifiedInstruments) -> bool:
+def _is_needless(reported: ReportedCause, found: IdentifiedInstruments) -> bool:
     """Whether a wire's parameter is not certain once it is identified beside all others."""
-    kind = _wire_parameter(told.finding)
-    value, sigma = found.placed[told.instrument].wire.get(kind, (0.0, 0.0)) if kind else (1.0, 0.0)
+    kind = _wire_parameter(reported.finding)
+    value, sigma = found.placed[reported.instrument].wire.get(kind, (0.0, 0.0)) if kind else (1.0, 0.0)
     return (bool(kind) and abs(value) < CERTAIN * sigma) or (bool(kind) and sigma == 0.0)
 
 

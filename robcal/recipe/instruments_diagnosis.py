@@ -25,7 +25,7 @@ from robcal.diagnosis.search.selection import SelectionSettings
 from robcal.errors import RobcalError
 from robcal.physics.cause import ObservationCause
 from robcal.physics.measuring import WIRE_SCALE
-from robcal.recipe.instruments_delivery import Anew, InstrumentsDiagnosis, Told, delivered
+from robcal.recipe.instruments_delivery import Anew, InstrumentsDiagnosis, ReportedCause, delivered
 from robcal.recipe.recording import recording_for_diagnosis
 from robcal.recipe.wire_alarms import scale_by_lengths
 from robcal.recipe.wires import Correction
@@ -63,7 +63,7 @@ def diagnose_instruments(
     best = max(p.instrument.dimension for p in taking_part.values())
     others = [p.instrument for p in taking_part.values() if p.instrument.dimension == best]
     own: dict[str, Diagnosis] = {}
-    not_told: list[str] = []
+    not_separable: list[str] = []
     cases: dict[str, _Case] = {}
     for name, placed in taking_part.items():
         against = others if placed.instrument.dimension < best else []
@@ -71,20 +71,22 @@ def diagnose_instruments(
         if case is None:
             continue
         if case.recording.hidden and not _lengths_are_believed(options):
-            not_told.append(
+            not_separable.append(
                 f"a wrong scale of wire '{name}' cannot be told: neither is its tool's place known nor do lengths of "
                 "the robot have priors, and no instrument that measures more identifies the robot"
             )
         tell(f"instrument '{name}'")
         cases[name] = case
         own[name] = diagnose(case.model, case.recording, case.free, case.tied, None, settings or SelectionSettings())
-    told = [Told(f, name) for name, d in own.items() for f in d.findings]
-    told = _distinct([_compared(t, cases) for t in told])
-    told += [
-        t for n, c in cases.items() if c.recording.hidden and (t := _scale_of(n, c, model, found, log, options, told))
+    reported = [ReportedCause(f, name) for name, d in own.items() for f in d.findings]
+    reported = _distinct([_compared(t, cases) for t in reported])
+    reported += [
+        t
+        for n, c in cases.items()
+        if c.recording.hidden and (t := _scale_of(n, c, model, found, log, options, reported))
     ]
     anew = Anew(model, found, instruments, log, options or IdentifyOptions(), corrections or {}, own)
-    return delivered(anew, told, tuple(not_told))
+    return delivered(anew, reported, tuple(not_separable))
 
 
 @dataclass(frozen=True)
@@ -109,8 +111,8 @@ def _case(
     if robot is None or recording is None:
         return None
     if placed.instrument.dimension == 1:
-        told = bool(others) or max(placed.instrument.tool.sigma[:3]) <= KNOWN
-        recording = replace(recording, hidden=() if told else (WIRE_SCALE.name,))
+        reported = bool(others) or max(placed.instrument.tool.sigma[:3]) <= KNOWN
+        recording = replace(recording, hidden=() if reported else (WIRE_SCALE.name,))
     free, at = robot.names, robot.model
     if others:
         try:
@@ -140,14 +142,14 @@ def _scale_of(
     found: IdentifiedInstruments,
     log: JointLog,
     options: IdentifyOptions | None,
-    told: Sequence[Told],
-) -> Told | None:
+    reported: Sequence[ReportedCause],
+) -> ReportedCause | None:
     """A wrong scale of a wire that leaves no trace in the residuals, where lengths of links with priors tell it."""
-    known = any(t.instrument == name and t.finding.cause.stage == "wire" for t in told)
+    known = any(t.instrument == name and t.finding.cause.stage == "wire" for t in reported)
     if known or options is None or not _lengths_are_believed(options):
         return None
     finding = scale_by_lengths(model, found, name, case.recording, log, options)
-    return None if finding is None else Told(finding, name, by_priors=True)
+    return None if finding is None else ReportedCause(finding, name, by_priors=True)
 
 
 def _known_errors(model: RobotModel, recording: Recording, names: Sequence[str], covariance: Array) -> Array:
@@ -164,14 +166,14 @@ def _known_errors(model: RobotModel, recording: Recording, names: Sequence[str],
     return np.asarray(B @ J[recording.observations.pose] @ root)
 
 
-def _compared(told: Told, cases: Mapping[str, _Case]) -> Told:
+def _compared(reported: ReportedCause, cases: Mapping[str, _Case]) -> ReportedCause:
     """A cause of the robot with what the other instruments say of it."""
-    finding = told.finding
+    finding = reported.finding
     if isinstance(finding.cause, ObservationCause) or not len(finding.values):
-        return told
+        return reported
     agreeing, contradicting = [], []
     for name, case in cases.items():
-        if name == told.instrument:
+        if name == reported.instrument:
             continue
         answer = _amplitudes(finding, case)
         if answer is None:
@@ -183,7 +185,7 @@ def _compared(told: Told, cases: Mapping[str, _Case]) -> Told:
             contradicting.append(name)
         elif _improbable(values, covariance) < SHOWS:
             agreeing.append(name)
-    return replace(told, agreeing=tuple(agreeing), contradicting=tuple(contradicting))
+    return replace(reported, agreeing=tuple(agreeing), contradicting=tuple(contradicting))
 
 
 def _amplitudes(finding: Finding, case: _Case) -> tuple[Array, Array] | None:
@@ -206,10 +208,10 @@ def _improbable(values: Array, covariance: Array) -> float:
     return float(stats.chi2.sf(square, len(values)))
 
 
-def _distinct(told: Sequence[Told]) -> list[Told]:
+def _distinct(reported: Sequence[ReportedCause]) -> list[ReportedCause]:
     """Every cause of the robot once, by the instrument that shows it best; most significant first."""
-    out: list[Told] = []
-    for t in sorted(told, key=lambda t: (t.finding.p_value, -t.finding.log_evidence)):
+    out: list[ReportedCause] = []
+    for t in sorted(reported, key=lambda t: (t.finding.p_value, -t.finding.log_evidence)):
         same = [o for o in out if not o.of_instrument and o.finding.cause.key == t.finding.cause.key]
         if t.of_instrument or not same:
             out.append(t)

@@ -62,8 +62,8 @@ def wire_alarms(
     off = {n: robot.values[n] - model.parameters.get(n, 0.0) for n in links}
     stated = {n: options.priors[n] for n in links if n in options.priors}
     far = [n for n in stated if abs(off[n]) - USUAL_LENGTH > SURE * np.hypot(_sigma(robot, n), stated[n])]
-    told = [f"{n} {1e3 * off[n]:+.2f} +- {1e3 * _sigma(robot, n):.2g} mm" for n in far]
-    reason = f"links are off by more than links may be ({', '.join(told)}), which a fault of the wire does"
+    named = [f"{n} {1e3 * off[n]:+.2f} +- {1e3 * _sigma(robot, n):.2g} mm" for n in far]
+    reason = f"links are off by more than links may be ({', '.join(named)}), which a fault of the wire does"
     best = 0.0
     for placed in identified:
         for kind in LIMITS:

@@ -50,9 +50,9 @@ def identify_with_corrections(
         found = identify_instruments(model, log, current, options)
         rounds += 1
     found = identify_from_instruments(model, log, current, options)
-    told = f"lengths of {' and '.join(corrections)} corrected from outside in {rounds} rounds, they changed by "
-    told += f"{1e3 * change:.2g} mm in the last one" + ("" if change <= SETTLED else ": they do not rest")
-    return replace(found, notes=(*found.notes, told))
+    message = f"lengths of {' and '.join(corrections)} corrected from outside in {rounds} rounds, they changed by "
+    message += f"{1e3 * change:.2g} mm in the last one" + ("" if change <= SETTLED else ": they do not rest")
+    return replace(found, notes=(*found.notes, message))
 
 
 def corrected(raw: Instrument, found: IdentifiedInstruments, log: JointLog, correction: Correction) -> Instrument:

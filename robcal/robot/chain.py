@@ -80,7 +80,14 @@ class Chain:
 
 
 def chain_of(model: RobotModel) -> Chain:
-    """Joint lines of the nominal geometry of a model (its parameters and terms are ignored)."""
+    """Joint lines of the nominal geometry of a model (its parameters and terms are ignored).
+
+    Raises
+    ------
+    InvalidInput : the robot is a Stewart platform.
+    """
+    if model.is_hexapod:
+        raise InvalidInput(f"robot '{model.name}' is a Stewart platform: this works for chains of joints only")
     T = np.eye(4)
     axes, points, frames, moved_by, lines = [], [], [], [], []
     for f in model.frames:

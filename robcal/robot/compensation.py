@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from robcal.errors import InvalidInput
 from robcal.robot.chain import Chain, chain_of, forward, forward_and_jacobian
+from robcal.robot.hexapod import leg_commands, nominal_frames
 from robcal.robot.inverse import (
     EXPLAINED,
     UNEXPLAINED,
@@ -143,6 +144,9 @@ def compensate(
     if frame not in ("world", "base"):
         raise InvalidInput(f"frames can be given in 'world' or 'base' coordinates, not '{frame}'")
     world_T_base, flange_T_tool = cell_frames(kernel)
+    if kernel.model.is_hexapod:
+        every = kernel.poses(np.zeros((len(check_frames(wanted)), 6)), payload, covariates)
+        return _leg_lengths(kernel, check_frames(wanted), every, frame, options)
     nominal = chain_of(kernel.model)
     # the tool belongs to the chain: arms of fewer than six joints give the tool's position precedence, not the flange's
     chain = replace(nominal, home=nominal.home @ flange_T_tool)
@@ -175,6 +179,30 @@ def compensate(
     with np.errstate(invalid="ignore"):
         converged = _size(chain, state.remaining) <= 10.0 * options.tolerance
     return Compensation(state.q, F_star, state.remaining, before, reachable, tuple(state.reason), converged, steps)
+
+
+def _leg_lengths(
+    kernel: Kernel, wanted: Array, every: PoseInputs, frame: str, options: CompensationSettings
+) -> Compensation:
+    """Commands for a Stewart platform: its inverse is closed, with its deviations as without ('none')."""
+    world_T_base, flange_T_tool = cell_frames(kernel)
+    target = wanted if frame == "world" else world_T_base @ wanted
+    platform = invert(world_T_base) @ target @ invert(flange_T_tool)
+    found = leg_commands(kernel.model, platform, calibrated=options.method != "none")
+    plain = leg_commands(kernel.model, platform, calibrated=False)
+    remaining, before, F_star = np.full((len(wanted), 6), np.nan), np.full((len(wanted), 6), np.nan), wanted + np.nan
+
+    def twist(q: Array, rows: Rows) -> Array:
+        return difference(target[rows], kernel.frames(kernel.theta0, every.subset(rows).with_q(q[rows])))
+
+    rows, nominal = np.flatnonzero(found.reachable), np.flatnonzero(plain.reachable)
+    remaining[rows], before[nominal] = twist(found.q, rows), twist(plain.q, nominal)
+    if len(rows):
+        tool = nominal_frames(kernel.model, found.q[rows]) @ flange_T_tool
+        F_star[rows] = tool if frame == "base" else world_T_base @ tool
+    with np.errstate(invalid="ignore"):
+        converged = np.max(np.abs(remaining), axis=1, initial=0.0) <= 10.0 * options.tolerance
+    return Compensation(found.q, F_star, remaining, before, found.reachable, found.reason, converged, 1)
 
 
 @dataclass

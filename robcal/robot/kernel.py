@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from robcal.errors import InvalidInput
-from robcal.robot.kernel_graph import PoseGraph, pose_graph
+from robcal.robot.hexapod_graph import hexapod_graph
+from robcal.robot.kernel_graph import PoseGraph, chain_graph
 from robcal.robot.model import GEOMETRIC_KINDS, RobotModel, parameter_names
 from robcal.robot.statics import moment_names
 from robcal.robot.terms import identifier
@@ -66,6 +67,16 @@ class ScanBasis:
 
     names: tuple[str, ...]
     J: Array
+
+
+def pose_graph(model: RobotModel, statics: str = "one_step", derivatives: bool = True) -> PoseGraph:
+    """The graph of a model: of a chain, or of a Stewart platform.
+
+    Raises
+    ------
+    InvalidInput : as :func:`chain_graph` and :func:`hexapod_graph` do.
+    """
+    return hexapod_graph(model, derivatives) if model.is_hexapod else chain_graph(model, statics, derivatives)
 
 
 class Kernel:
@@ -207,7 +218,14 @@ class Kernel:
         return flat.reshape(len(poses), self.model.n_joints, 6).transpose(0, 2, 1)
 
     def scan_basis(self, theta: ArrayLike, poses: PoseInputs) -> ScanBasis:
-        """Tool twists of every coordinate of base, chain and tool, and of every joint."""
+        """Tool twists of every coordinate of base, chain and tool, and of every joint.
+
+        Raises
+        ------
+        InvalidInput : the robot is a Stewart platform.
+        """
+        if self.model.is_hexapod:
+            raise InvalidInput(f"robot '{self.model.name}' is a Stewart platform: it has no frames to scan")
         (flat,) = self._evaluate("basis", theta, poses)
         frames = ["base", *(f.name for f in self.model.frames), "tool"]
         names = [f"{frame}.{kind}" for frame in frames for kind in GEOMETRIC_KINDS]

@@ -53,8 +53,8 @@ class PoseGraph:
     torques: ca.SX
 
 
-def pose_graph(model: RobotModel, statics: str = "one_step", derivatives: bool = True) -> PoseGraph:
-    """Build the graph of a model.
+def chain_graph(model: RobotModel, statics: str = "one_step", derivatives: bool = True) -> PoseGraph:
+    """Build the graph of a chain.
 
     Raises
     ------
@@ -62,7 +62,7 @@ def pose_graph(model: RobotModel, statics: str = "one_step", derivatives: bool =
     """
     if statics not in ("one_step", "converged"):
         raise InvalidInput(f"statics must be one_step or converged, not '{statics}'")
-    x = _Inputs.of(model)
+    x = Inputs.of(model)
     pull = _Pull.of(model, x)
     m = ca.SX.sym("m", len(moment_names(model)))
     torques, on_cranks = _torques(model, x, m)
@@ -77,7 +77,7 @@ def pose_graph(model: RobotModel, statics: str = "one_step", derivatives: bool =
             chain = pull.chain(ca.substitute(coordinates, m, moment))
             moment = moments(model, chain)
     deflected = ca.substitute(coordinates, m, moment) if coupled else coordinates
-    tool = _tool_chain(deflected, len(model.frames), x.world_T_base, x.flange_T_tool)
+    tool = tool_chain(deflected, len(model.frames), x.world_T_base, x.flange_T_tool)
     world_T_tool = ca.horzcat(tool.tool_R_world.T, -ca.mtimes(tool.tool_R_world.T, tool.world_origin))
     if not derivatives:
         empty = ca.SX()
@@ -108,7 +108,7 @@ def pose_graph(model: RobotModel, statics: str = "one_step", derivatives: bool =
 
 
 @dataclass(frozen=True)
-class _Inputs:
+class Inputs:
     """Symbols of all inputs; ``index`` of the parameters in ``theta``."""
 
     theta: ca.SX
@@ -121,7 +121,7 @@ class _Inputs:
     covariate_names: tuple[str, ...]
 
     @classmethod
-    def of(cls, model: RobotModel) -> "_Inputs":
+    def of(cls, model: RobotModel) -> "Inputs":
         names, covariates = parameter_names(model), _covariates(model)
         return cls(
             ca.SX.sym("theta", len(names)),
@@ -153,7 +153,7 @@ class _Pull:
     load_columns: dict[int, tuple[ca.SX, ca.SX]]
 
     @classmethod
-    def of(cls, model: RobotModel, x: _Inputs) -> "_Pull":
+    def of(cls, model: RobotModel, x: Inputs) -> "_Pull":
         return cls(model, x.world_T_base, *_gravity(model, x.theta, x.index), *_load(model, x.theta, x.index, x.load))
 
     def _base_R(self, base_six: ca.SX) -> ca.SX:
@@ -230,7 +230,7 @@ def _gravity(model: RobotModel, theta: ca.SX, index: dict[str, int]) -> tuple[ca
 
 
 def _coordinates(
-    model: RobotModel, x: _Inputs, m: ca.SX, loads: tuple[ca.SX, dict[str, ca.SX]], load_mass: ca.SX
+    model: RobotModel, x: Inputs, m: ca.SX, loads: tuple[ca.SX, dict[str, ca.SX]], load_mass: ca.SX
 ) -> ca.SX:
     """Free coordinates: six of base, every frame, and tool, then the crank angle of each four-bar.
 
@@ -278,7 +278,7 @@ def _coordinates(
     return ca.vertcat(*values, *cranks.values())
 
 
-def _coupled(model: RobotModel, x: _Inputs, free: ca.SX) -> ca.SX:
+def _coupled(model: RobotModel, x: Inputs, free: ca.SX) -> ca.SX:
     """Six coordinates of base, every frame, and tool: the free ones, and what the joints turn along."""
     size = 6 * (len(model.frames) + 2)
     if not model.has_loops:
@@ -303,7 +303,7 @@ def _coupled(model: RobotModel, x: _Inputs, free: ca.SX) -> ca.SX:
     return out
 
 
-def _propagation(model: RobotModel, x: _Inputs, free: ca.SX) -> ca.SX:
+def _propagation(model: RobotModel, x: Inputs, free: ca.SX) -> ca.SX:
     """Derivative of all coordinates by the free ones."""
     symbols = ca.SX.sym("free", free.shape)
     return ca.substitute(ca.jacobian(_coupled(model, x, symbols), symbols), symbols, free)
@@ -315,14 +315,14 @@ def _crank_rows(model: RobotModel) -> dict[str, int]:
     return {name: 6 * (len(model.frames) + 2) + k for k, name in enumerate(driven)}
 
 
-def _lengths(x: _Inputs, f: Frame) -> ca.SX:
+def _lengths(x: Inputs, f: Frame) -> ca.SX:
     """Crank, coupler, rocker and ground with their deviations."""
     own = [x.theta[x.index[f"{f.name}.{kind}"]] for kind in FOUR_BAR_LENGTHS]
     nominal = f.fourbar.lengths if f.fourbar is not None else ()
     return ca.vertcat(*(length + deviation for length, deviation in zip(nominal, own, strict=True)))
 
 
-def _torques(model: RobotModel, x: _Inputs, m: ca.SX) -> tuple[ca.SX, dict[str, ca.SX]]:
+def _torques(model: RobotModel, x: Inputs, m: ca.SX) -> tuple[ca.SX, dict[str, ca.SX]]:
     """What the weights exert on each joint (N,), in the sense of q: the moments of all frames that it turns; and what
     they exert on the crank of each four-bar."""
     names = moment_names(model)
@@ -359,13 +359,13 @@ def _symbols(model: RobotModel, q: ca.SX, m: ca.SX, torques: ca.SX, load_mass: c
 
 
 @dataclass(frozen=True)
-class _ToolChain:
+class ToolChain:
     tool_R_world: ca.SX
     world_origin: ca.SX
     columns: ca.SX
 
 
-def _tool_chain(c: ca.SX, n: int, W0: ca.SX, F0: ca.SX) -> _ToolChain:
+def tool_chain(c: ca.SX, n: int, W0: ca.SX, F0: ca.SX) -> ToolChain:
     """From the tool inwards, all in tool coordinates: ``rho = o x z`` for a turn about z through o, ``omega = z``."""
     R, o = ca.SX.eye(3), ca.SX.zeros(3)  # rotation and origin of the frame reached, seen from the tool
     blocks: list[ca.SX] = []
@@ -381,7 +381,7 @@ def _tool_chain(c: ca.SX, n: int, W0: ca.SX, F0: ca.SX) -> _ToolChain:
         if reference is not None:
             R = ca.mtimes(R, reference[:, :3].T)
             o = o - ca.mtimes(R, reference[:, 3])
-    return _ToolChain(R, o, ca.horzcat(*reversed(blocks)))
+    return ToolChain(R, o, ca.horzcat(*reversed(blocks)))
 
 
 def _base_lines(six: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:

@@ -6,6 +6,7 @@ Parameter names (deviations from nominal, metres, radians, rad/(N m), kg):
 
 - ``<frame>.<x|y|z|roll|pitch|yaw>`` and ``<frame>.elastic_<roll|pitch|yaw>`` for every frame of the chain,
 - ``<frame>.<crank|coupler|rocker|ground|crank_angle|elastic_crank>`` for every frame that a four-bar turns,
+- ``<frame>.<base_x..base_z|platform_x..platform_z|offset>`` instead of these for every leg of a Stewart platform,
 - ``base.<x..yaw>``, ``tool.<x..yaw>``: on the right of the references ``world_T_base`` and ``flange_T_tool``,
 - ``gravity.tilt_x``, ``gravity.tilt_y``: turn of the gravity vector about the x and y axes of the frame it is given in,
 - ``payload.<name>.mass|x|y|z``: deviation of a payload's mass and centre of gravity (flange coordinates),
@@ -21,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robcal.errors import InvalidInput
+from robcal.robot.legs import LEG_KINDS, Leg
 from robcal.robot.loops import FOUR_BAR_KINDS, FOUR_BAR_LENGTHS, FourBar
 
 Array = NDArray[np.float64]
@@ -28,6 +30,7 @@ Triple = tuple[float, float, float]
 
 GEOMETRIC_KINDS = ("x", "y", "z", "roll", "pitch", "yaw")
 ELASTIC_KINDS = ("elastic_roll", "elastic_pitch", "elastic_yaw")
+LENGTH_KINDS = frozenset({"x", "y", "z", "offset", *FOUR_BAR_LENGTHS, *LEG_KINDS})
 ANGLE_OF_AXIS = {"x": "roll", "y": "pitch", "z": "yaw"}
 STANDARD_GRAVITY = (0.0, 0.0, -9.80665)
 RESERVED_FRAME_NAMES = frozenset({"base", "tool", "gravity", "payload"})
@@ -50,6 +53,7 @@ class Frame:
     follows : (joint, coefficient) pairs: the angle about ``axis`` also turns by so much of these joints (from 0).
     fourbar : the angle about ``axis`` is, times ``sign``, a rocker's whose crank a joint turns, its own or another's.
     passive : the frame turns by ``follows`` or ``fourbar`` alone, it carries no joint.
+    leg : the frame is no link of a chain but a leg of a Stewart platform; its joint is the leg's length.
     """
 
     name: str
@@ -64,6 +68,7 @@ class Frame:
     follows: tuple[tuple[int, float], ...] = ()
     fourbar: FourBar | None = None
     passive: bool = False
+    leg: Leg | None = None
 
     @property
     def is_joint(self) -> bool:
@@ -85,7 +90,8 @@ class Frame:
     @property
     def zero_name(self) -> str:
         """Parameter that acts as the joint's zero offset: its own angle or length, of a four-bar the crank's angle."""
-        return f"{self.name}.{'crank_angle' if self.fourbar is not None else self.joint_kind}"
+        kind = "crank_angle" if self.fourbar is not None else "offset" if self.leg is not None else self.joint_kind
+        return f"{self.name}.{kind}"
 
     @property
     def elastic_name(self) -> str:
@@ -95,7 +101,7 @@ class Frame:
     @property
     def zero_sign(self) -> int:
         """What the parameter ``zero_name`` of one counts in the sense of q."""
-        return 1 if self.fourbar is not None else self.sign
+        return 1 if self.fourbar is not None or self.leg is not None else self.sign
 
 
 @dataclass(frozen=True)
@@ -142,11 +148,13 @@ class Term:
 
 @dataclass(frozen=True)
 class RobotModel:
-    """A serial chain with masses, payloads, parameters and terms.
+    """A chain, or a Stewart platform, with masses, payloads, parameters and terms.
 
     Attributes
     ----------
-    frames : from the base to the flange; the last one is the flange, in which payloads are given.
+    frames : from the base to the flange; the last one is the flange, in which payloads are given. Of a Stewart platform
+        its six legs; then the flange is the platform and weights have no effect.
+    home : (4, 4) base_T_platform of a Stewart platform from which its forward kinematics starts; None for chains.
     gravity : m/s2, in coordinates of ``gravity_frame`` ('base' or 'world', the measuring system).
     parameters : deviations that are not zero, by name (see the module's text); those of terms live in the terms.
     world_T_base, flange_T_tool : (4, 4) references, None while unknown (then taken as identity).
@@ -165,13 +173,14 @@ class RobotModel:
     payloads: Mapping[str, Payload] = field(default_factory=dict)
     world_T_base: Array | None = None
     flange_T_tool: Array | None = None
+    home: Array | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "frames", tuple(self.frames))
         object.__setattr__(self, "terms", tuple(self.terms))
         object.__setattr__(self, "parameters", dict(self.parameters))
         object.__setattr__(self, "payloads", dict(self.payloads))
-        for name in ("world_T_base", "flange_T_tool"):
+        for name in ("world_T_base", "flange_T_tool", "home"):
             value = getattr(self, name)
             if value is not None:
                 matrix = np.array(value, dtype=float)
@@ -190,6 +199,11 @@ class RobotModel:
     def n_joints(self) -> int:
         """Number of joints."""
         return len(self.joints)
+
+    @property
+    def is_hexapod(self) -> bool:
+        """Whether the robot is a Stewart platform."""
+        return any(f.leg is not None for f in self.frames)
 
     @property
     def has_loops(self) -> bool:
@@ -233,8 +247,15 @@ class RobotModel:
         return replace(self, parameters={}, terms=())
 
 
+def geometric_kinds(frame: Frame) -> tuple[str, ...]:
+    """Kinds of geometric parameters that a frame has, those of four-bars left out."""
+    return GEOMETRIC_KINDS if frame.leg is None else ("offset", *LEG_KINDS)
+
+
 def frame_kinds(frame: Frame) -> tuple[str, ...]:
     """Kinds of parameters that a frame has."""
+    if frame.leg is not None:
+        return geometric_kinds(frame)
     return (*GEOMETRIC_KINDS, *ELASTIC_KINDS, *(FOUR_BAR_KINDS if frame.fourbar is not None else ()))
 
 
@@ -262,13 +283,15 @@ def parameter_unit(model: RobotModel, name: str) -> str:
         return "rad/(N m)"
     if kind == "mass":
         return "kg"
-    return "m" if kind in ("x", "y", "z", *FOUR_BAR_LENGTHS) else "rad"
+    return "m" if kind in LENGTH_KINDS else "rad"
 
 
 def _check(model: RobotModel) -> None:
     where = f"robot '{model.name}'"
     if not any(f.is_joint for f in model.frames):
         raise InvalidInput(f"{where}: the chain has no joint; give at least one frame an axis x, y or z")
+    if model.is_hexapod and (len(model.frames) != 6 or any(f.leg is None for f in model.frames) or model.home is None):
+        raise InvalidInput(f"{where}: a Stewart platform has six legs, nothing else, and a home")
     seen: set[str] = set()
     for f in model.frames:
         if not f.name or f.name in seen or f.name in RESERVED_FRAME_NAMES or "." in f.name:
@@ -336,6 +359,8 @@ def _check_loop(model: RobotModel, f: Frame, where: str) -> None:
 def _check_term(model: RobotModel, term: Term, where: str) -> None:
     if term.frame not in {"base", "tool", *(f.name for f in model.frames)}:
         raise InvalidInput(f"{where}: there is no frame '{term.frame}'")
+    if model.is_hexapod and term.kind != "q":
+        raise InvalidInput(f"{where}: terms of a Stewart platform act on the lengths of its legs, kind q")
     if term.kind not in (*GEOMETRIC_KINDS, "q"):
         raise InvalidInput(f"{where}: kind '{term.kind}' is not q, x, y, z, roll, pitch or yaw")
     if term.kind == "q" and model.joint_of(term.frame) is None:

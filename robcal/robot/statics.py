@@ -114,6 +114,8 @@ def moments(model: RobotModel, chain: StaticChain) -> ca.SX:
 
 def moment_names(model: RobotModel) -> list[str]:
     """Names of the entries of :func:`moments` as expressions know them, forces of sliding joints last."""
+    if model.is_hexapod:
+        return []
     names = ["base_mx", "base_my", "base_mz"]
     names += [f"{identifier(f.name)}_m{k}" for f in model.frames for k in ("roll", "pitch", "yaw")]
     return names + [f"{identifier(f.name)}_force" for f in model.frames if f.prismatic and f.axis is not None]

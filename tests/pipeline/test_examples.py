@@ -41,6 +41,6 @@ def test_cameras(path: Path) -> None:
     assert read_camera(path).camera.width > 0
 
 
-@pytest.mark.parametrize("path", files("robots"), ids=lambda p: p.stem)
+@pytest.mark.parametrize("path", [*files("robots"), *files("hexapods")], ids=lambda p: p.stem)
 def test_robots(path: Path) -> None:
     assert read_robot(path).n_joints >= 4

@@ -160,10 +160,9 @@ def test_killed_in_diagnosis_verification_and_report(frame_campaign: Path, tmp_p
     edit_yaml(frame_campaign / "campaign.yaml", lambda d: d.pop("diagnosis"))
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     run_campaign(frame_campaign, whole, workers=1)
-    for stage in ("diagnose", "verify", "report"):
-        for when in ("first write", "before the record"):
-            kill_in(frame_campaign, killed, stage, when, until="report")
-            assert Run(killed).record(stage) is None
+    for stage, when in (("diagnose", "before the record"), ("verify", "first write"), ("report", "first write")):
+        kill_in(frame_campaign, killed, stage, when, until="report")
+        assert Run(killed).record(stage) is None
     resumed = run_campaign(frame_campaign, killed, workers=1)
     assert resumed.ran == ("report",)
     assert results(killed) == results(whole)

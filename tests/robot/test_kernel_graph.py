@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from robcal.errors import InvalidInput
-from robcal.robot.kernel_graph import PoseGraph, expression_variables, pose_graph
+from robcal.robot.kernel_graph import PoseGraph, chain_graph, expression_variables
 from robcal.robot.model import GEOMETRIC_KINDS, RobotModel, Term, parameter_names
 from robcal.transforms import Array, frame_from_xyzrpy
 from tests.robot.chains import kr_like, random_chain, random_theta
@@ -44,7 +44,7 @@ def test_without_elasticity_the_graph_is_a_product_of_frames(seed: int) -> None:
     names = parameter_names(model)
     theta = np.where(["elastic" in n for n in names], 0.0, random_theta(rng, names, 10.0))
     q = rng.uniform(-1, 1, model.n_joints)
-    graph = pose_graph(model)
+    graph = chain_graph(model)
     np.testing.assert_allclose(
         evaluated(graph, theta, q, [graph.world_T_tool])[0], rigid(model, theta, q)[:3], atol=1e-12
     )
@@ -55,7 +55,7 @@ def test_converged_statics_are_a_fixed_point() -> None:
     names = parameter_names(model)
     theta = np.array([2e-6 if "elastic" in n else 0.0 for n in names])
     q = np.array([0.3, -0.6, 0.9, 0.4, -0.5, 0.2])
-    graph = pose_graph(model, "converged")
+    graph = chain_graph(model, "converged")
     T, m = evaluated(graph, theta, q, [graph.world_T_tool, graph.moments])
     # deflections of these very moments put into the rigid chain as deviations give the same tool frame
     bent = dict(zip(names, theta, strict=True))
@@ -63,14 +63,14 @@ def test_converged_statics_are_a_fixed_point() -> None:
         for k, kind in enumerate(("roll", "pitch", "yaw")):
             bent[f"{frame.name}.{kind}"] = bent[f"{frame.name}.elastic_{kind}"] * m[3 + 3 * i + k, 0]
     np.testing.assert_allclose(T, rigid(model, np.array([bent[n] for n in names]), q)[:3], atol=1e-12)
-    one_step = pose_graph(model)
+    one_step = chain_graph(model)
     assert np.abs(evaluated(one_step, theta, q, [one_step.world_T_tool])[0] - T).max() > 1e-7
 
 
 def test_terms_bring_their_covariates_and_act_on_their_frame() -> None:
     term = Term("drift", "axis2", "x", "rate*time_s + slope*temp_c", {"rate": 1e-6, "slope": 2e-6})
     model = kr_like(terms=(term,))
-    graph = pose_graph(model, derivatives=False)
+    graph = chain_graph(model, derivatives=False)
     assert graph.covariates == ("temp_c", "time_s")
     assert graph.jacobian.numel() == 0
     theta = np.array([{"drift.rate": 1e-6, "drift.slope": 2e-6}.get(n, 0.0) for n in parameter_names(model)])
@@ -87,4 +87,4 @@ def test_names_that_expressions_may_use() -> None:
 
 def test_unknown_statics_are_refused() -> None:
     with pytest.raises(InvalidInput, match="one_step or converged, not 'rigid'"):
-        pose_graph(kr_like(), "rigid")
+        chain_graph(kr_like(), "rigid")

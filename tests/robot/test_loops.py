@@ -117,7 +117,7 @@ def test_torque_of_a_motor_holds_all_that_it_turns(tmp_path):
     assert np.max(np.abs(found["torque2"] - found["axis2_mpitch"])) > 500.0
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", [pytest.param("parallelogram", marks=pytest.mark.slow), "fourbar"])
 def test_identified_to_the_noise_with_its_loop(kind, tmp_path):
     truth = true_palletiser(5, kind == "fourbar")
     rng = np.random.default_rng(6)

@@ -205,9 +205,9 @@ def _own_parameters(found: Found, part: int, titles: Mapping[str, str]) -> tuple
     turn = np.eye(len(full))
     turn[len(robot) :, len(robot) :] = found.evaluator.to_right_twists(found.solution.state, part)
     full = transport_covariance(turn, full)
-    told = [*range(len(robot)), *(len(robot) + k for k in range(12) if full[len(robot) + k, len(robot) + k] > 0)]
+    reported = [*range(len(robot)), *(len(robot) + k for k in range(12) if full[len(robot) + k, len(robot) + k] > 0)]
     labels = (*(names[k] for k in robot), *kernel_ends())
-    return tuple(labels[k] for k in told), full[np.ix_(told, told)]
+    return tuple(labels[k] for k in reported), full[np.ix_(reported, reported)]
 
 
 def _cell_block(names: Sequence[str], covariance: Array) -> Array:

@@ -24,11 +24,12 @@ def joint_trials(recorded: Recorded, fast: bool) -> Iterator[Trial]:
     """Units, senses and columns of the joint log; where a trial takes long (not ``fast``), the common ones alone."""
     names = [f.name for f in recorded.model.joints]
     yield from _units(np.array([not f.prismatic for f in recorded.model.joints]))
-    yield from _senses(names, fast)
+    if not recorded.model.is_hexapod:  # a leg has no negative length
+        yield from _senses(names, fast)
     for i, k in combinations(range(len(names)), 2):
         order = np.arange(len(names))
         order[[i, k]] = k, i
-        words = f"the columns of joints {i + 1} and {k + 1} are exchanged"
+        words = f"the columns of {'legs' if recorded.model.is_hexapod else 'joints'} {i + 1} and {k + 1} are exchanged"
         yield Trial("exchanged_columns", f"{names[i]} and {names[k]}", words, "exchange the two columns", _take(order))
 
 
@@ -92,6 +93,8 @@ def _mix(matrix: Array) -> Callable[[Recorded], Recorded]:
 def _axes(recorded: Recorded) -> Iterator[Trial]:
     """A joint about another axis than the robot file says."""
     joint = 0
+    if recorded.model.is_hexapod:
+        return
     for at, frame in enumerate(recorded.model.frames):
         if not frame.is_joint:
             continue

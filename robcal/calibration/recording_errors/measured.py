@@ -141,14 +141,15 @@ def _conventions() -> Iterator[Trial]:
             readings.append((_order_words(columns, axes), _turns(columns, axes)))
     readings.append(("rotation vectors (axis times angle)", tf.exp_so3))
     for words, reading in readings:
-        told = f"the measured angles are {words}" if words else ""
+        message = f"the measured angles are {words}" if words else ""
         convert = "give roll, pitch and yaw about the fixed axes x, y, z (R = Rz Ry Rx) of the tool in the world"
         if words:
-            yield Trial("orientation", WHERE, told, convert, _on_frames(_read(reading, False)))
+            yield Trial("orientation", WHERE, message, convert, _on_frames(_read(reading, False)))
         transposed = "the measured rotations are transposed (of the world in the tool, not of the tool in the world)"
-        text = f"{transposed}{f', and {told[4:]}' if told else ''}"
+        text = f"{transposed}{f', and {message[4:]}' if message else ''}"
         yield Trial("orientation", WHERE, text, convert, _on_frames(_read(reading, True)))
-        text = f"the measured frames are inverted (the world seen from the tool){f', and {told[4:]}' if told else ''}"
+        also = f", and {message[4:]}" if message else ""
+        text = f"the measured frames are inverted (the world seen from the tool){also}"
         yield Trial("inverted_frames", WHERE, text, f"invert them: {convert}", _on_frames(_inverse(reading)))
 
 

@@ -15,7 +15,7 @@ from robcal.calibration.observations import FrameObservations, Observations, Poi
 from robcal.calibration.problem import Evaluator
 from robcal.calibration.start_values import candidates
 from robcal.errors import DegenerateGeometry, NotIdentifiable, RobcalError
-from robcal.robot.chain import Chain, chain_of, forward
+from robcal.robot.hexapod import nominal_frames
 from robcal.robot.kernel import Kernel, PoseInputs
 from robcal.robot.model import Frame, RobotModel
 
@@ -32,12 +32,11 @@ class Recorded:
 
     Attributes
     ----------
-    chain, base_T_flange : the nominal robot and its flange (n, 4, 4) at the poses.
+    base_T_flange : (n, 4, 4) flange of the nominal robot at the poses.
     kernel : of the model, where no frames are measured that give base and tool in closed form.
     """
 
     model: RobotModel
-    chain: Chain
     poses: PoseInputs
     base_T_flange: Array
     observations: tuple[Observations, ...]
@@ -46,14 +45,13 @@ class Recorded:
     @classmethod
     def of(cls, model: RobotModel, poses: PoseInputs, observations: Sequence[Observations]) -> "Recorded":
         """With the nominal robot at the poses."""
-        chain = chain_of(model)
         closed = any(isinstance(o, FrameObservations) for o in observations)
         kernel = None if closed else Kernel(model.nominal())
-        return cls(model, chain, poses, forward(chain, poses.q), tuple(observations), kernel)
+        return cls(model, poses, nominal_frames(model, poses.q, strict=False), tuple(observations), kernel)
 
     def with_q(self, q: Array) -> "Recorded":
         """The same with other joint angles (n, N)."""
-        return replace(self, poses=self.poses.with_q(q), base_T_flange=forward(self.chain, q))
+        return replace(self, poses=self.poses.with_q(q), base_T_flange=nominal_frames(self.model, q, strict=False))
 
     def with_frames(self, frames: Sequence[Frame]) -> "Recorded":
         """The same with another chain in the robot file."""

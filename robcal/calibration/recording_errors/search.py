@@ -43,6 +43,10 @@ AMBIGUOUS = 1.3
 """Alternatives that miss by no more than this factor of the best are candidates as well."""
 
 
+def _log_words(model: RobotModel) -> str:
+    return "leg lengths" if model.is_hexapod else "joint angles"
+
+
 def find_faults(
     model: RobotModel, poses: PoseInputs, observations: Sequence[Observations], share: float = SUSPICIOUS_SHARE
 ) -> list[RecordingFault]:
@@ -153,7 +157,7 @@ def check_joint_log(
     _check_unit(inputs, recording, kernel)
     found = find_faults(robot, inputs, recording.observations)
     if found and not found[0].legitimate:
-        raise InvalidInput(f"joint angles and measurements do not belong together: {described(found)}")
+        raise InvalidInput(f"{_log_words(robot)} and measurements do not belong together: {described(found)}")
     return found
 
 
@@ -173,7 +177,7 @@ def check_failed_fit(
     few = replace(recording, observations=recording.select(rows))
     fault = fault_of(robot, inputs.subset(rows), few, share=0.0)
     if fault:
-        raise InvalidInput(f"joint angles and measurements do not belong together: {fault}")
+        raise InvalidInput(f"{_log_words(robot)} and measurements do not belong together: {fault}")
     T = found.kernel.frames(found.kernel.theta0, inputs)
     miss = float(np.sqrt(np.mean(np.concatenate([o.evaluate(T)[0].ravel() ** 2 for o in recording.observations]))))
     size = float(np.linalg.norm(np.std(T[:, :3, 3], axis=0)))

@@ -59,7 +59,7 @@ class Finding:
     waits: str = ""
 
     @property
-    def told(self) -> str:
+    def full_statement(self) -> str:
         """The statement, and that it is not in force where that is so."""
         return f"{self.statement} (not in force in the delivered robot)" if self.waits else self.statement
 

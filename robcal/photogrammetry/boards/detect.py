@@ -175,11 +175,11 @@ def _circles(image: NDArray, board: Board, polarity: Polarity) -> Detections:
     for reason, count in dots.rejected.counts.items():
         log.count(reason, count)
     if rows is None:
-        told = (
+        text = (
             f"{len(dots)} dots but no grid of {board.columns} x {board.rows} circles among them: it must be seen as a "
             "whole, and no other dots near it"
         )
-        return _table(image, empty_columns(), dots.noise, log, dots.message or told)
+        return _table(image, empty_columns(), dots.noise, log, dots.message or text)
     columns = {name: column[rows] for name, column in dots.columns().items()}
     columns["code"] = board.ids()
     columns["kind"] = np.full(len(rows), TargetKind.CIRCLE, np.int8)

@@ -145,9 +145,9 @@ def fit_sphere(points: ArrayLike, name: str = "") -> tuple[Array, float]:
     InvalidInput : fewer than four points, points in a plane, or points that are on no sphere.
     """
     p = np.asarray(points, dtype=float)
-    told = f"body '{name}'" if name else "the body"
+    message = f"body '{name}'" if name else "the body"
     if len(p) < 4 or thickness_ratio(p) < _PLANE_RATIO:
-        raise InvalidInput(f"{told} is no sphere: at least four targets with coordinates that are not in a plane")
+        raise InvalidInput(f"{message} is no sphere: at least four targets with coordinates that are not in a plane")
     middle = p.mean(axis=0)
     centre = middle + _sphere_centre(p - middle)
     radii = np.linalg.norm(p - centre, axis=1)
@@ -155,7 +155,7 @@ def fit_sphere(points: ArrayLike, name: str = "") -> tuple[Array, float]:
     if np.ptp(radii) > _ON_SPHERE * radius:
         worst = int(np.argmax(np.abs(radii - radius)))
         raise InvalidInput(
-            f"{told} is no sphere: its targets are {1e3 * radii.min():.2f} to {1e3 * radii.max():.2f} mm from one "
+            f"{message} is no sphere: its targets are {1e3 * radii.min():.2f} to {1e3 * radii.max():.2f} mm from one "
             f"centre (row {worst + 1} of its targets is farthest off): check the coordinates"
         )
     return centre, radius

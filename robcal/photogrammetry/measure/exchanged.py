@@ -77,10 +77,10 @@ def _in_pose(measured: Array, body: Array) -> list[tuple[int, int, float, float]
         after = float(np.median(swapped))
         if before > LEAST_DEVIATION and after < LEFT_OVER * before:
             trials.append((after, before, i, j))
-    told: list[tuple[int, int, float, float]] = []
+    reported: list[tuple[int, int, float, float]] = []
     taken: set[int] = set()
     for after, before, i, j in sorted(trials):
         if not {i, j} & taken:
             taken |= {i, j}
-            told.append((i, j, before, after))
-    return told
+            reported.append((i, j, before, after))
+    return reported

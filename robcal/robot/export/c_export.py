@@ -29,8 +29,7 @@ from robcal.robot.export.c_expressions import array, function_body, number
 from robcal.robot.inverse import carried_arm
 from robcal.robot.inverse_analytic import perpendicular
 from robcal.robot.inverse_numeric import NumericSettings, start_configurations
-from robcal.robot.kernel import Kernel
-from robcal.robot.kernel_graph import pose_graph
+from robcal.robot.kernel import Kernel, pose_graph
 from robcal.robot.model import Payload, RobotModel
 from robcal.robot.structure import SphericalWrist, find_structure
 from robcal.transforms import Array, invert

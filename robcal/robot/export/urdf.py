@@ -41,8 +41,10 @@ def urdf_text(model: RobotModel, template: str | None = None) -> str:
 
     Raises
     ------
-    InvalidInput : the template's joints are not the robot's; a robot with a four-bar, or with loops and a template.
+    InvalidInput : the template's joints are not the robot's; a Stewart platform, a four-bar, loops with a template.
     """
+    if model.is_hexapod:
+        raise InvalidInput(f"URDF has no closed chains: it cannot express the Stewart platform '{model.name}'")
     bars = [f.name for f in model.frames if f.fourbar is not None]
     if bars:
         raise InvalidInput(

@@ -9,7 +9,7 @@ from robcal.calibration.instruments import CellFrame, Instrument
 from robcal.calibration.joint_log import JointLog
 from robcal.calibration.measurements import RobotRecording
 from robcal.calibration.observations import SensorPointObservations
-from robcal.recipe.instruments import with_told_orientations
+from robcal.recipe.instruments import with_determined_orientations
 from robcal.robot.kernel import Kernel
 from robcal.transforms import Array, frame_from_xyzrpy, transform, xyzrpy_from_frame
 from tests.robot.chains import kr_like
@@ -38,7 +38,7 @@ def eye(width: float, angles: Array) -> tuple[Kernel, JointLog, Instrument]:
 @pytest.mark.parametrize(("width", "told"), [(0.003, False), (0.12, True)])
 def test_a_wide_view_tells_the_orientation_a_narrow_one_does_not(width: float, told: bool) -> None:
     kernel, log, instrument = eye(width, xyzrpy_from_frame(TOOL)[3:])
-    (out,), (note,) = with_told_orientations(kernel, log, [instrument])
+    (out,), (note,) = with_determined_orientations(kernel, log, [instrument])
     assert (out.tool.sigma[3] == np.inf) == told
     assert ("is identified" in note) == told
     assert "eye" in note
@@ -47,4 +47,4 @@ def test_a_wide_view_tells_the_orientation_a_narrow_one_does_not(width: float, t
 def test_what_is_stated_otherwise_stays_as_it_is() -> None:
     kernel, log, instrument = eye(0.12, xyzrpy_from_frame(TOOL)[3:])
     plain = replace(instrument, tool=replace(instrument.tool, certified=False))
-    assert with_told_orientations(kernel, log, [plain]) == ([plain], [])
+    assert with_determined_orientations(kernel, log, [plain]) == ([plain], [])
