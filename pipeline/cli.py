@@ -267,6 +267,9 @@ def compensate(
 @app.command()
 def report(
     run_folder: RunFolder,
+    compare: Annotated[
+        Path | None, typer.Option("--compare", metavar="RUN", help="Write what changed since this run as well.")
+    ] = None,
     pdf: Annotated[bool, typer.Option("--pdf", help="Print it to report.pdf as well (needs Chromium).")] = False,
     quiet: Quiet = False,
     as_json: Json = False,
@@ -275,7 +278,7 @@ def report(
     with answers("report", as_json, quiet) as answer:
         from pipeline.commands import report_again
 
-        for kind, path in report_again(run_folder, pdf=pdf).items():
+        for kind, path in report_again(run_folder, compare, pdf=pdf).items():
             answer[kind] = str(path)
             LOG.info(str(path))
 
@@ -299,7 +302,7 @@ def demo(
 
 @app.command(short_help="Generate measuring poses for a campaign.")
 def poses(
-    config: Annotated[Path, typer.Argument(metavar="CONFIG", help="YAML file of the format robcal/poses-1.")],
+    config: Annotated[Path, typer.Argument(metavar="CONFIG", help="YAML file of the format robcal/poses-1, or a run.")],
     out: Annotated[Path, typer.Option("--out", help="Table of poses to write.")],
     quiet: Quiet = False,
     as_json: Json = False,
@@ -359,6 +362,7 @@ def export(
         Path | None, typer.Option("--ur-kinematics", help="Universal Robots' kinematics.yaml of the calibrated robot.")
     ] = None,
     data: Annotated[Path | None, typer.Option("--data", help="Folder for parameters as CSV and JSON.")] = None,
+    ros: Annotated[Path | None, typer.Option("--ros", help="Folder for ROS: URDF, transforms, camera_info.")] = None,
     template: Annotated[
         Path | None,
         typer.Option("--template", help="URDF (its meshes stay) or kinematics.yaml the robot was read from."),
@@ -368,12 +372,14 @@ def export(
     as_json: Json = False,
 ) -> None:
     """Export the calibrated robot for controllers and simulators."""
-    if all(path is None for path in (c, urdf, table, kinematics, data)):
-        wrong_use("name what to write: --c FOLDER, --urdf FILE, --table FILE, --ur-kinematics FILE, --data FOLDER")
+    if all(path is None for path in (c, urdf, table, kinematics, data, ros)):
+        wrong_use(
+            "name what to write: --c FOLDER, --urdf FILE, --table FILE, --ur-kinematics FILE, --data or --ros FOLDER"
+        )
     with answers("export", as_json, quiet) as answer:
         from pipeline.exports import Wanted, export_run
 
-        written, notes = export_run(run_folder, Wanted(c, table, urdf, kinematics, data, template), at_cycle)
+        written, notes = export_run(run_folder, Wanted(c, table, urdf, kinematics, data, ros, template), at_cycle)
         answer["files"] = [str(path) for path in written]
         answer["warnings"] = notes
         for sentence in notes:

@@ -12,7 +12,7 @@ import typer
 
 from pipeline.json_io import plain
 from pipeline.messages import LOG, Heard, show
-from robcal.errors import RobcalError
+from robcal.errors import InvalidInput, RobcalError
 
 Quiet = Annotated[bool, typer.Option("-q", "--quiet", help="Only warnings and errors on standard error.")]
 Json = Annotated[bool, typer.Option("--json", help="One result line for programs on standard output.")]
@@ -23,6 +23,8 @@ InstrumentName = Annotated[
 ]
 CampaignPath = Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="Campaign folder, or its YAML file.")]
 
+SHOWN = 20
+"""Sentences of one error that a terminal shows."""
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells expect it."""
 
@@ -43,10 +45,10 @@ def answers(command: str, as_json: bool, quiet: bool) -> Iterator[dict[str, Any]
             command,
             as_json,
             "interrupted: the same command goes on where it was, finished stages are kept",
-            INTERRUPTED,
+            code=INTERRUPTED,
         )
     except RobcalError as error:
-        _fail(command, as_json, " ".join(str(error).split()))
+        _fail(command, as_json, *_sentences(error))
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
         _fail(command, as_json, f"{where}{error.strerror or error}")
@@ -65,10 +67,21 @@ def answers(command: str, as_json: bool, quiet: bool) -> Iterator[dict[str, Any]
         typer.echo(json.dumps(plain({"ok": True, "command": command, **answer})))
 
 
-def _fail(command: str, as_json: bool, sentence: str, code: int = 1) -> None:
-    typer.echo(f"error: {sentence}", err=True)
+def _sentences(error: RobcalError) -> list[str]:
+    """The error's text, and what else was found wrong with it."""
+    first = " ".join(str(error).split())
+    faults = [" ".join(fault.split()) for fault in error.faults] if isinstance(error, InvalidInput) else []
+    return list(dict.fromkeys([first, *faults]))
+
+
+def _fail(command: str, as_json: bool, *sentences: str, code: int = 1) -> None:
+    for sentence in sentences[:SHOWN]:
+        typer.echo(f"error: {sentence}", err=True)
+    if len(sentences) > SHOWN:
+        typer.echo(f"error: and {len(sentences) - SHOWN} more: --json lists all", err=True)
     if as_json:
-        typer.echo(json.dumps({"ok": False, "command": command, "error": sentence}))
+        more = {"errors": list(sentences)} if len(sentences) > 1 else {}
+        typer.echo(json.dumps({"ok": False, "command": command, "error": sentences[0], **more}))
     raise typer.Exit(code)
 
 

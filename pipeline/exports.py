@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.cell_exports import ros_texts, write_cell_tables
 from pipeline.json_io import write_json
 from pipeline.robot_in_force import robot_in_force
 from robcal.calibration.calibrated import CalibratedRobot
@@ -33,6 +34,7 @@ class Wanted:
     urdf: Path | None = None
     kinematics: Path | None = None
     data: Path | None = None
+    ros: Path | None = None
     template: Path | None = None
 
 
@@ -57,6 +59,11 @@ def export_run(folder: Path, wanted: Wanted, at_cycle: int | None = None) -> tup
         texts[wanted.urdf] = urdf_text(calibrated.model, template)
     if wanted.kinematics is not None:
         texts[wanted.kinematics] = _kinematics(calibrated, wanted, notes)
+    if wanted.ros is not None:
+        texts[wanted.ros / "robot.urdf"] = urdf_text(calibrated.model, None)
+        cell, left = ros_texts(folder, cell_frames(calibrated.kernel)[0])
+        texts |= {wanted.ros / name: text for name, text in cell.items()}
+        notes += left
     for path, text in texts.items():
         write_text(path, text)
     written = list(texts)
@@ -65,7 +72,7 @@ def export_run(folder: Path, wanted: Wanted, at_cycle: int | None = None) -> tup
         write_table(wanted.table, {"parameter": list(values), "value": [repr(v) for v in values.values()]})
         written.append(wanted.table)
     if wanted.data is not None:
-        written += _write_data(calibrated, wanted.data)
+        written += [*_write_data(calibrated, wanted.data), *write_cell_tables(folder, wanted.data)]
     return written, notes
 
 

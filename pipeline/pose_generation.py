@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.hand_eye_poses import write_views
+from pipeline.pose_request_of_run import describe_run
 from pipeline.pose_schema import FORMAT, PosesEntry, metres
 from robcal.calibration.collision import Capsule, Obstacle, link_capsules
 from robcal.calibration.pose_candidates import Cell
@@ -33,10 +34,15 @@ RADIUS_TOLERANCE = 1e-3
 def generate_poses(config: Path, out: Path) -> dict[str, Any]:
     """Write measuring poses for a cell, and beside them the path with the points to drive through.
 
+    Of a run folder in place of a description one is written beside the poses, with the run's robot, base and tool.
+
     Raises
     ------
     InvalidInput : the description contradicts itself, or no pose of the cell can be measured.
     """
+    if config.is_dir():
+        run, config = config, out.with_name(f"{out.stem}_cell.yaml")
+        describe_run(run, config)
     entry = read_entry(config, PosesEntry, FORMAT)[0]
     if entry.sensor is not None:
         return _generate_sensor_poses(config, out)

@@ -64,6 +64,11 @@ def correct_program(  # noqa: PLR0913 - options by keyword
         covariates=robot.defaults,
         near=None if robot.q is None else robot.q[0],
     )
+    if not found.joints and not found.frames:
+        raise InvalidInput(
+            f"{program}: no motion to a target was found, there is nothing to correct and nothing was written: is it "
+            f"the file with the motions, and a program of {language} (--dialect)?"
+        )
     for place, text in reversed(list(zip(places, found.texts, strict=True))):  # the program last: it uses the data
         write_atomic(place, lambda stream, content=text: stream.write(content.encode("latin-1")))  # type: ignore[misc]
     return _answer(found, program, places, payload, list(robot.model.payloads))
@@ -73,9 +78,7 @@ def _answer(
     found: Corrected, program: Path, places: Sequence[Path], payload: str | None, payloads: Sequence[str]
 ) -> dict[str, Any]:
     warnings = list(found.notes)
-    if not found.joints and not found.frames:
-        warnings.append(f"{program}: holds no targets")
-    elif payload is None and payloads:
+    if payload is None and payloads:
         warnings.append(f"corrected for the robot without payload: name what it carries with --payload ({payloads[0]})")
     before, remaining = (1e3 * np.linalg.norm(t[:, :3], axis=1) for t in (found.before, found.remaining))
     return {

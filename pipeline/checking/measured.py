@@ -4,11 +4,13 @@ import numpy as np
 
 from pipeline.bodies import body_for_robot
 from pipeline.campaign import Campaign
-from pipeline.checking.joints import Looked
+from pipeline.checking.joints import Doubts
+from pipeline.checking.similar_robots import robots_that_fit_better
 from pipeline.runs import Run
 from pipeline.stages.identify import check_joint_limits
 from pipeline.stages.observations import build_recording
 from robcal.calibration.recording_errors.search import check_joint_log
+from robcal.errors import InvalidInput
 from robcal.files.frame_tables import NEARLY_LOCKED
 from robcal.files.measurement_tables import MeasuredTable
 from robcal.files.schemas import proposal
@@ -24,7 +26,7 @@ FEW_ROWS = 2.0
 """Numbers measured for each parameter of the geometry, base and tool, below which there is little to average."""
 
 
-def measured_doubts(campaign: Campaign) -> Looked:
+def measured_doubts(campaign: Campaign) -> Doubts:
     """Units, angles near the singularity, one orientation, few numbers, ids that nothing lists."""
     faults: list[str] = []
     doubts: list[str] = []
@@ -131,18 +133,25 @@ def _some(ids: set[int]) -> str:
     return ", ".join(map(str, named[:12])) + (f", ... ({len(named)})" if len(named) > 12 else "")
 
 
-def recording_faults(campaign: Campaign) -> Looked:
+def recording_faults(campaign: Campaign) -> Doubts:
     """Whether joint log, robot file and measurements belong together, as the identification will ask."""
     robot, poses = campaign.robot, campaign.poses
     nowhere = Run(campaign.path / "none")  # nothing has run yet
-    check_joint_limits(campaign, nowhere)
     if robot is None or poses is None or not campaign.measurements or campaign.instruments:
+        check_joint_limits(campaign, nowhere)
         return [], []
     body = body_for_robot(campaign, nowhere)
     located = body is not None and bool(np.isfinite(body.points).all())
     if not located and any(table.kind in ("points", "sensor_points") for table in campaign.measurements):
+        check_joint_limits(campaign, nowhere)
         return [], []  # their frames follow from the points themselves, in the run
     kernel = Kernel(robot, campaign.entry.model.statics)
-    recording = build_recording(campaign, nowhere, body)
-    slips = check_joint_log(robot, poses.inputs(kernel), recording, kernel)
-    return [], [f"{poses.path}: {slip.statement}: {slip.remedy}" for slip in slips]
+    recording, inputs = build_recording(campaign, nowhere, body), poses.inputs(kernel)
+    file = campaign.entry.robot.file if campaign.entry.robot else "robot"
+    other = robots_that_fit_better(robot, inputs, recording, file)
+    try:
+        check_joint_limits(campaign, nowhere)
+        slips = check_joint_log(robot, inputs, recording, kernel)
+    except InvalidInput as error:
+        return list(error.faults), other
+    return [], (other if not slips else []) + [f"{poses.path}: {slip.statement}: {slip.remedy}" for slip in slips]

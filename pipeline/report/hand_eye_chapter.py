@@ -7,7 +7,8 @@ from pipeline.report.blocks import Block, Chapter, Figure, KeyFigure, Text, Verd
 from pipeline.report.material import Material
 from pipeline.report.style import ACCENT, AFTER, GREY, layout, number, rounded, trace
 from pipeline.stages.hand_eye import HandEyeRun, frames_of
-from robcal.files.hand_eye_files import SCALE, static_transform
+from robcal.files.hand_eye_files import SCALE, in_ros
+from robcal.files.ros_files import static_transform
 from robcal.handeye.motion import turns
 from robcal.transforms import xyzrpy_from_frame
 
@@ -24,7 +25,9 @@ def hand_eye_chapter(material: Material) -> Chapter:
         if kept.found.rejected:
             rows = [[kept.poses[r.image], r.reason.format(*kept.poses)] for r in kept.found.rejected]
             blocks.append(table(["Image left out", "Why"], rows, text=(0, 1)))
-        blocks.append(Text("To load: " + static_transform(frames_of(kept.found)[0], material_camera(material)), "note"))
+        blocks.append(
+            Text("To load: " + static_transform(in_ros(frames_of(kept.found)[0], material_camera(material))), "note")
+        )
     return Chapter("hand-eye", "Hand-eye calibration", "", tuple(blocks))
 
 

@@ -21,6 +21,7 @@ from robcal.photogrammetry.core.bodies import Body
 from robcal.photogrammetry.core.camera import INTRINSIC_NAMES, Camera
 from robcal.photogrammetry.core.network import Lengths
 from robcal.photogrammetry.survey.given_coordinates import GivenCoordinates, compare_given
+from robcal.photogrammetry.survey.splined_lens import SplinedSurvey, with_splined_lens
 from robcal.photogrammetry.survey.survey import SurveyImage, SurveyResult, survey_body
 from robcal.recipe.survey import hardly_seen, marks_by_image, size_of_marks, survey_targets, surveyed_body
 
@@ -34,22 +35,29 @@ def work(context: Context) -> Outcome:
     for name, source in campaign.bodies.items():
         if source.survey is None or source.survey_entry is None or (context.body and name != context.body):
             continue
-        done = survey_one(campaign, run, name, source)
+        done, splined = survey_one(campaign, run, name, source)
         body = surveyed_body(name, source.file, done, _not_on_it(campaign, run, name, source))
         outputs += [run.save(artifacts.survey(name), done), run.save(artifacts.surveyed_body(name), body)]
         outputs += _write(run, name, source, body, done)
         notes += [f"survey of '{name}': {note}" for note in survey_notes(done)]
         doubts = _against_given(campaign, source, done)
         notes += doubts.sentences(name)
+        if splined is not None:
+            notes.append(f"survey of '{name}': {_told(splined)}")
         results[name] = survey_section(done) | {
+            "splined_lens": None
+            if splined is None
+            else {"rms_px": splined.field.rms, "z": splined.field.z, "sigma0_px_before": splined.before},
             "contradictions": doubts.sentences(name),
             "mirrored_mm": doubts.mirrored_mm,
         }
     return Outcome({"survey": results}, outputs, notes)
 
 
-def survey_one(campaign: Campaign, run: Run, name: str, source: BodySource) -> SurveyResult:
-    """Survey one body.
+def survey_one(
+    campaign: Campaign, run: Run, name: str, source: BodySource
+) -> tuple[SurveyResult, SplinedSurvey | None]:
+    """Survey one body, with a splined lens where the residuals ask for it.
 
     Raises
     ------
@@ -61,19 +69,35 @@ def survey_one(campaign: Campaign, run: Run, name: str, source: BodySource) -> S
     check_lengths(campaign, name, entry)
     images, size = _images(run, name, images_of, source.file)
     datum = tuple(entry.datum.fixed) if isinstance(entry.datum, FixedDatum) else entry.datum
-    try:
+    engine = campaign.entry.bundle.engine
+
+    def survey(camera: Camera | None) -> SurveyResult:
         return survey_body(
             images,
             survey_targets(source.file, entry.ends),
             size=size,
-            camera=images_of.start.camera if images_of.start else None,
+            camera=camera,
             scale_bars=lengths(entry.scale_bars),
             check_lengths=lengths(entry.check_lengths),
             datum=datum,
-            engine=campaign.entry.bundle.engine,
+            engine=engine,
         )
+
+    try:
+        done = survey(images_of.start.camera if images_of.start else None)
+        splined = with_splined_lens(done, survey) if engine == "robcal" else None
+        return (done if splined is None else splined.result), splined
     except RobcalError as error:
         raise located(error, f"{campaign.path}: survey of body '{name}'") from None
+
+
+def _told(splined: SplinedSurvey) -> str:
+    field = splined.field
+    return (
+        f"the residuals have a pattern over the image that Brown's lens cannot have ({field.rms:.2g} px RMS, "
+        f"{field.z:.1f} standard deviations on images that did not make it): a splined lens takes it up, residuals "
+        f"{splined.before:.3g} -> {splined.result.network.sigma0_px:.3g} px"
+    )
 
 
 def _against_given(campaign: Campaign, source: BodySource, done: SurveyResult) -> GivenCoordinates:

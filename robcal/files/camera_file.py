@@ -1,10 +1,11 @@
 """Camera files (format robcal/camera-1): interior orientation and, optionally, where the camera stands."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from pydantic import BeforeValidator, Field
 
 from robcal.errors import InvalidInput
@@ -15,9 +16,11 @@ from robcal.files.storage import write_text
 from robcal.files.yaml_io import FlowMapping, yaml_text
 from robcal.photogrammetry.core.camera import INTRINSIC_NAMES, Camera
 from robcal.photogrammetry.core.lenses import FISHEYE_NAMES, RATIONAL_NAMES, FisheyeCamera, RationalCamera
+from robcal.photogrammetry.core.splined import LEAST_NODES, SplinedCamera
 from robcal.transforms import Array
 
 FORMAT = "robcal/camera-1"
+MODELS: tuple[tuple[type[Camera], str], ...] = ((FisheyeCamera, "fisheye"), (SplinedCamera, "splined"))
 MAX_PIXELS = 100_000
 CORNER = 0.12
 """A principal point nearer to the top-left corner (of the sides) is one counted from the middle."""
@@ -32,13 +35,20 @@ def _side(value: Any) -> Any:
 Side = Annotated[int, BeforeValidator(_side)]
 
 
+class SplineEntry(Entry):
+    """Control points of a splined lens: rows of shifts, px."""
+
+    dx_px: list[list[Number]]
+    dy_px: list[list[Number]]
+
+
 class CameraEntry(Entry):
     """The whole file."""
 
     format: Literal["robcal/camera-1"]
     width: Side
     height: Side
-    model: Literal["opencv", "fisheye"] = "opencv"
+    model: Literal["opencv", "fisheye", "splined"] = "opencv"
     fx: Positive
     fy: Positive
     cx: Number
@@ -55,6 +65,7 @@ class CameraEntry(Entry):
     s2: Number | None = None
     s3: Number | None = None
     s4: Number | None = None
+    spline: SplineEntry | None = None
     pixel_um: Positive | None = None
     world_T_camera: Placement | None = None
     flange_T_camera: Placement | None = None
@@ -110,6 +121,8 @@ def read_camera(path: Path | str) -> CameraFile:
 def _camera(entry: CameraEntry, file: str) -> Camera:
     """The camera with the lens that its entries tell: fisheye, rational where it has more than Brown's terms."""
     given = {name for name in (*RATIONAL_NAMES, "k4") if getattr(entry, name)}
+    if entry.model == "splined" or entry.spline is not None:
+        return _splined(entry, file)
     kind: type[Camera] = Camera
     if entry.model == "fisheye":
         if extra := sorted(given - set(FISHEYE_NAMES)):
@@ -119,6 +132,31 @@ def _camera(entry: CameraEntry, file: str) -> Camera:
         kind = RationalCamera
     blank = kind(entry.width, entry.height, entry.fx, entry.fy, entry.cx, entry.cy)
     return blank.with_vector([getattr(entry, name) or 0.0 for name in blank.names])
+
+
+def _splined(entry: CameraEntry, file: str) -> SplinedCamera:
+    """Brown's lens with splines.
+
+    Raises
+    ------
+    InvalidInput : splines without ``model: splined`` or the reverse, terms of other lenses, tables that do not fit.
+    """
+    if entry.spline is None or entry.model != "splined":
+        raise InvalidInput(
+            f"{file}: 'model: splined' and 'spline' (dx_px, dy_px) belong together: give both or neither"
+        )
+    others = RATIONAL_NAMES[len(INTRINSIC_NAMES) :]
+    if extra := [name for name in others if getattr(entry, name)]:
+        raise InvalidInput(f"{file}: a splined lens has k1 to k3, p1, p2 and no {', '.join(extra)}: remove them")
+    dx, dy = entry.spline.dx_px, entry.spline.dy_px
+    widths = {len(row) for row in (*dx, *dy)}
+    if len(dx) != len(dy) or len(widths) != 1 or min(len(dx), *widths) < LEAST_NODES:
+        raise InvalidInput(
+            f"{file}: dx_px and dy_px of 'spline' need as many rows and columns as one another, {LEAST_NODES} or more"
+        )
+    numbers = [getattr(entry, name) for name in INTRINSIC_NAMES]
+    nodes = np.stack([np.array(dx, dtype=float), np.array(dy, dtype=float)], axis=-1)
+    return replace(SplinedCamera(entry.width, entry.height, *numbers), nodes=nodes)
 
 
 def _check(camera: Camera, where: Mapping[str, str]) -> None:
@@ -148,8 +186,10 @@ def write_camera(path: Path | str, content: CameraFile, comment: str = "") -> No
     """Write a camera file atomically."""
     camera = content.camera
     data: dict[str, Any] = {"format": FORMAT, "width": camera.width, "height": camera.height}
-    data["model"] = "fisheye" if isinstance(camera, FisheyeCamera) else "opencv"
+    data["model"] = next((m for kind, m in MODELS if isinstance(camera, kind)), "opencv")
     data.update({name: float(getattr(camera, name)) for name in camera.names})
+    if isinstance(camera, SplinedCamera):
+        data["spline"] = {f"d{axis}_px": camera.nodes[..., k].tolist() for k, axis in enumerate("xy")}
     if content.pixel_um is not None:
         data["pixel_um"] = float(content.pixel_um)
     for name in ("world_T_camera", "flange_T_camera", "base_T_camera"):

@@ -16,6 +16,7 @@ from robcal.errors import InvalidInput
 from robcal.files.robot_file import read_robot
 from robcal.files.storage import read_bytes
 from robcal.files.tables import read_table
+from robcal.files.ur_calibration import read_ur_calibration
 from robcal.files.yaml_io import read_yaml
 from robcal.robot.dh import DHRow, frames_from_dh
 from robcal.robot.model import RobotModel
@@ -53,6 +54,9 @@ def read_any_robot(path: Path | str, base_link: str | None = None, tip_link: str
         raise InvalidInput(f"{file}: base_link and tip_link choose links of a URDF, this is none")
     if suffix == ".csv":
         return _read_dh(file)
+    if suffix == ".conf":
+        rows = read_ur_calibration(file)
+        return _named(file, lambda: RobotModel(file.stem, frames_from_dh(rows)))
     data = read_yaml(file).data
     if "format" not in data and isinstance(data.get("kinematics"), Mapping):
         return _read_ur(file, data["kinematics"])

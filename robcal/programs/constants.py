@@ -131,7 +131,7 @@ def program(names: Names, uses: Sequence[Use], marks: Sequence[Edit], notes: Seq
 
     Raises
     ------
-    Refusal : a motion's target cannot be told from the text; the message counts the further ones.
+    Refusal : a motion's target cannot be told from the text; its faults are all of them.
     """
     found: dict[tuple[int, int], Target] = {}
     refusals: list[Refusal] = []
@@ -154,10 +154,9 @@ def program(names: Names, uses: Sequence[Use], marks: Sequence[Edit], notes: Seq
 
 
 def several(refusals: Sequence[Refusal]) -> Refusal:
-    """One refusal that names the first and counts the others."""
+    """One refusal whose text is the first, with all of them as its faults."""
     told = list(dict.fromkeys(str(r) for r in refusals))
-    more = f" (and {len(told) - 1} more such places)" if len(told) > 1 else ""
-    return Refusal(told[0] + more + "; nothing was written")
+    return Refusal(f"{told[0]}; nothing was written", (f"{told[0]}; nothing was written", *told[1:]))
 
 
 def _both(a: FrameOf, b: FrameOf, first: Target, second: Target) -> FrameOf:

@@ -56,7 +56,7 @@ HEAD = "format: robcal/camera-1\nwidth: 1280\nheight: 960\nfx: 400\nfy: 400\ncx:
     ("text", "message"),
     [
         (HEAD + "model: fisheye\np1: 0.1\n", "a fisheye lens has k1 to k4 and no p1"),
-        (HEAD + "model: omni\n", "must be 'opencv' or 'fisheye'"),
+        (HEAD + "model: omni\n", "must be 'opencv', 'fisheye' or 'splined'"),
         (HEAD + "k7: 0.1\n", "unknown key 'k7'"),
         (HEAD + "k4: much\n", "must be a number"),
     ],

@@ -135,3 +135,30 @@ def test_parameters_leave_as_plain_data(finished: tuple[Path, Path], tmp_path: P
         if not name.startswith(("base.", "tool.")):
             assert values[name] == data["parameters"][name]["value"] == pytest.approx(value)
     assert data["covariance"]["names"] == list(robot.names)
+
+
+def test_ros_and_tables_of_the_cell(finished: tuple[Path, Path], tmp_path: Path) -> None:
+    source = finished[1]
+    run = Path(shutil.copytree(source, tmp_path / "run"))
+    (run / "cameras").mkdir()
+    camera = "format: robcal/camera-1\nwidth: 640\nheight: 480\nfx: 800\nfy: 801\ncx: 320\ncy: 240\nk1: -0.1\n"
+    (run / "cameras" / "left.yaml").write_text(camera + "world_T_camera: {xyz_mm: [1, 2, 3], rpy_deg: [0, 0, 90]}\n")
+    (run / "bodies").mkdir(exist_ok=True)
+    targets = "[{id: 17, code: ring12, xyz_mm: [1, 2, 3], sigma_mm: 0.01}, {id: 18, code: null, xyz_mm: null}]"
+    (run / "bodies" / "plate.yaml").write_text(f"format: robcal/body-1\ntargets: {targets}\n")
+    written, _ = export_run(run, Wanted(ros=tmp_path / "ros", data=tmp_path / "data"))
+    assert all(path.is_file() for path in written)
+
+    lines = (tmp_path / "ros" / "static_transform.sh").read_text().splitlines()
+    (told,) = [line for line in lines if "--child-frame-id left_optical_frame" in line]
+    assert "--x 0.001000000 --y 0.002000000 --z 0.003000000" in told
+    assert "--qz 0.707106781 --qw 0.707106781" in told
+    base = cell_frames(load_calibrated(open_run(run)).kernel)[0]
+    assert any(f"--x {base[0, 3]:.9f}" in line and "--child-frame-id base_link" in line for line in lines)
+    assert '<link name="base_link"' in (tmp_path / "ros" / "robot.urdf").read_text()
+    assert "camera_info_left.yaml" in {path.name for path in written}
+
+    assert read_table(tmp_path / "data" / "cameras.csv").columns["yaw_deg"] == ("90.000000000",)
+    body = read_table(tmp_path / "data" / "body_plate.csv").columns
+    assert body["x_mm"] == ("1.000000", "")
+    assert body["sx_mm"] == ("0.010000", "")

@@ -118,3 +118,18 @@ def test_the_program_itself_is_kept(run: Path, files: Path) -> None:
     result = runner.invoke(app, ["program", str(run), path, "--out", path])
     assert result.exit_code == 1
     assert "is the program itself" in result.output
+
+
+def test_every_refused_line_is_told(run: Path, files: Path) -> None:
+    (files / "part.src").write_bytes(SRC.replace(b"LIN XP1\n", b"LIN_REL {X 10}\nLIN XP1\nPTP_REL {A1 5}\n"))
+    output = program(run, files, *frames(files), "--json", ok=False)
+    answer = json.loads(output.splitlines()[-1])
+    assert answer["error"] == answer["errors"][0]
+    assert [f"line {n}" in sentence for n, sentence in zip((7, 9), answer["errors"], strict=True)] == [True, True]
+    assert not (files / "corrected").exists()
+
+
+def test_a_program_without_motions_is_refused(run: Path, files: Path) -> None:
+    (files / "part.src").write_text("DEF part()\nBAS(#TOOL, 1)\nEND\n")
+    assert "no motion to a target was found" in program(run, files, ok=False)
+    assert not (files / "corrected").exists()

@@ -1,7 +1,7 @@
 """Any lens as a camera of nine numbers, which surveys and stations adjust; its other coefficients stay as they are.
 
-A rational lens keeps k4 to k6 and its thin prism terms, a fisheye its k4 (and has no p1, p2), a splined lens its
-splines. What such a camera does not have among the nine is held, see :func:`adjustable_names`.
+A rational lens keeps k4 to k6 and its thin prism terms, a fisheye its k4 (and has no p1, p2). What such a camera does
+not have among the nine is held, see :func:`adjustable_names`.
 """
 
 from dataclasses import dataclass, replace
@@ -29,8 +29,8 @@ class AdjustableCamera(Camera):
 
 
 def adjustable(camera: Camera) -> Camera:
-    """The camera as one of nine numbers; Brown's is one already."""
-    if type(camera) is Camera or isinstance(camera, AdjustableCamera):
+    """The camera as one of nine numbers; Brown's and splined ones are such already."""
+    if camera.names == INTRINSIC_NAMES:
         return camera
     shared = {name: getattr(camera, name) for name in INTRINSIC_NAMES if name in camera.names}
     return AdjustableCamera(camera.width, camera.height, **shared, lens=camera)
