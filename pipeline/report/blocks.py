@@ -71,13 +71,37 @@ class Figure:
 
 
 @dataclass(frozen=True)
+class Mark:
+    """A target in a picture, px of the image: centre, semi-axes, angle (deg); `tip` of its residual, drawn large."""
+
+    x: float
+    y: float
+    a: float
+    b: float
+    angle: float
+    name: str
+    kind: str
+    text: str
+    tip: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True)
 class Picture:
-    """An embedded JPEG."""
+    """An embedded JPEG, with what was found in it.
+
+    `box`: x, y, width, height of the part of the image that it shows, px; `refused`: candidates that are no target;
+    `pose`: the pose it shows; `extra`: shown only while that pose is chosen.
+    """
 
     jpeg_base64: str
     caption: str
     width: int
     height: int
+    box: tuple[int, int, int, int]
+    marks: tuple[Mark, ...] = ()
+    refused: tuple[tuple[float, float], ...] = ()
+    pose: int | None = None
+    extra: bool = False
 
 
 @dataclass(frozen=True)

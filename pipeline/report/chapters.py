@@ -13,10 +13,12 @@ from pipeline.report.notes_chapter import files_chapter, rejected_chapter
 from pipeline.report.parameter_chapter import parameter_chapter
 from pipeline.report.survey_chapters import network_chapter, survey_chapter
 from pipeline.report.verification_chapter import verification_chapter
+from pipeline.report.workspace_chapter import workspace_chapter
 
 _RESULTS: tuple[Callable[[Material], Chapter], ...] = (
     hand_eye_chapter,
     verification_chapter,
+    workspace_chapter,
     diagnosis_chapter,
     rejected_chapter,
     files_chapter,

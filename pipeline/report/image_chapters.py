@@ -1,26 +1,21 @@
 """Chapters: detected targets on sample images, and image residuals."""
 
-import base64
 from collections.abc import Mapping
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.artifacts import detections
+from pipeline.detected_images import DetectionIndex, ImageEntry
 from pipeline.report.blocks import Block, Chapter, Figure, Picture, Pictures, table
 from pipeline.report.material import Material
+from pipeline.report.seen_images import SeenImages
 from pipeline.report.style import AFTER, GREY, label, layout, number, trace
-from robcal.errors import RobcalError
-from robcal.files.images import read_image
-from robcal.imaging.detections import CodeState, Detections
 from robcal.transforms import Array
 
-WIDTH = 900
-"""Width of the embedded pictures, px."""
 MOST_ARROWS = 2500
-JPEG_QUALITY = 78
-_ORANGE, _BLUE, _VERMILION, _SKY = (0, 159, 230), (178, 114, 0), (0, 94, 213), (233, 180, 86)
+MOST_EXTRA = 60
+BUDGET = 2_400_000
+"""Letters that pictures and their marks may take in the page."""
 
 
 def image_chapter(material: Material) -> Chapter:
@@ -28,7 +23,7 @@ def image_chapter(material: Material) -> Chapter:
     blocks: list[Block] = []
     index = material.detections
     if index is not None:
-        rows, pictures = [], []
+        rows = []
         for source in dict.fromkeys(e.source for e in index.entries):
             entries = index.of(source)
             counts = np.array([e.targets for e in entries])
@@ -44,12 +39,6 @@ def image_chapter(material: Material) -> Chapter:
                     str(int(np.sum(counts == 0))),
                 ]
             )
-            order = np.argsort(counts, kind="stable")
-            usual, poor = entries[int(order[len(order) // 2])], entries[int(order[0])]
-            for entry, why in ((usual, "usual"), (poor, "fewest targets")):
-                if why == "usual" or entry is not usual:
-                    picture = _picture(material, entry, why)
-                    pictures += [picture] if picture is not None else []
         blocks.append(
             table(
                 [
@@ -66,72 +55,58 @@ def image_chapter(material: Material) -> Chapter:
                 text=(0, 2),
             )
         )
-        if pictures:
-            blocks.append(
-                Pictures(
-                    tuple(pictures),
-                    "Blue: ellipse with a code read, and its id. Orange: dot without code. Light blue: a ring that "
-                    "could not be read. Small vermilion crosses: candidates that were refused.",
-                )
-            )
+        pictures = _pictures(material, index)
+        blocks += [pictures] if pictures is not None else []
     return Chapter("images", "Detected targets", "", tuple(blocks))
 
 
-def _picture(material: Material, entry: object, why: str) -> Picture | None:
-    """A sample image with its targets; None where the image or its detections are gone."""
-    name, path, key, source = (getattr(entry, n) for n in ("name", "path", "key", "source"))
-    campaign = material.campaign
-    if campaign is not None and not path.is_file():
-        return None
-    try:
-        grey = read_image(path)
-        found = material.run.load(detections(key))
-    except (RobcalError, OSError):
-        return None
-    jpeg, width, height = drawn(grey, found)
-    told = f"{source}, {name} ({why}): {len(found)} targets, {int(np.sum(found.code >= 0))} codes"
-    refused = sorted(found.rejected.counts.items(), key=lambda item: -item[1])[:3]
-    if refused:
-        # the examples in brackets belong to the table of reasons, not under every picture
-        told += "; refused: " + ", ".join(f"{count} {str(reason).split(' (')[0]}" for reason, count in refused)
-    return Picture(base64.b64encode(jpeg).decode("ascii"), told, width, height)
+def _worst_poses(material: Material) -> list[int]:
+    """Poses by their error where they were kept out, the worst first; then those with the worst residuals."""
+    order: list[int] = []
+    if material.verification is not None:
+        v, rows = material.verification
+        size = v.errors["0"]
+        if len(size) == len(v.rows):
+            order += [int(np.asarray(rows)[v.rows][i]) for i in np.argsort(-size, kind="stable")]
+    station = material.station
+    if station is not None:
+        square = np.bincount(station.marks.pose, np.sum(station.w**2, axis=1), minlength=len(station.poses))
+        count = np.maximum(np.bincount(station.marks.pose, minlength=len(station.poses)), 1)
+        order += [int(station.poses[i]) for i in np.argsort(-square / count, kind="stable")]
+    return list(dict.fromkeys(order))
 
 
-def drawn(grey: NDArray[np.uint8 | np.uint16], found: Detections, width: int = WIDTH) -> tuple[bytes, int, int]:
-    """JPEG of an image with ellipses and ids, its width and height."""
-    low, high = (float(v) for v in np.percentile(grey[::4, ::4], (1, 99.9)))
-    bright = np.clip((grey.astype(np.float32) - low) * (235.0 / max(high - low, 1.0)), 0, 235).astype(np.uint8)
-    scale = min(1.0, width / grey.shape[1])
-    size = (max(1, round(grey.shape[1] * scale)), max(1, round(grey.shape[0] * scale)))
-    canvas = cv2.cvtColor(cv2.resize(bright, size, interpolation=cv2.INTER_AREA), cv2.COLOR_GRAY2BGR)
-    # sub-pixel drawing: OpenCV takes coordinates with four binary places
-    for x, y in found.rejected.xy[:300]:
-        at = (round((x + 0.5) * scale - 0.5), round((y + 0.5) * scale - 0.5))
-        cv2.drawMarker(canvas, at, _VERMILION, cv2.MARKER_TILTED_CROSS, 4, 1)
-    for i in range(len(found)):
-        x, y = (found.xy[i] + 0.5) * scale - 0.5
-        axes = np.maximum(found.semi_axes[i] * scale * 1.25, 3.0)
-        read = found.code[i] >= 0
-        colour = _BLUE if read else _SKY if found.code_state[i] == CodeState.UNREADABLE else _ORANGE
-        cv2.ellipse(
-            canvas,
-            (round(x * 16), round(y * 16)),
-            (round(axes[0] * 16), round(axes[1] * 16)),
-            float(np.degrees(found.angle[i])),
-            0,
-            360,
-            colour,
-            2,
-            cv2.LINE_AA,
-            4,
-        )
-        if read:
-            at = (round(x + axes[0] + 3), round(y - axes[1] - 2))
-            for ink, thick in (((0, 0, 0), 3), ((255, 255, 255), 1)):
-                text = str(int(found.code[i]))
-                cv2.putText(canvas, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.5, ink, thick, cv2.LINE_AA)
-    _, encoded = cv2.imencode(".jpg", canvas, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-    return encoded.tobytes(), size[0], size[1]
+def _pictures(material: Material, index: DetectionIndex) -> Pictures | None:
+    """Samples of every source, and the images of the worst poses as far as the page may grow."""
+    seen = SeenImages(material)
+    sources = dict.fromkeys(e.source for e in index.entries)
+    chosen = [(e, why, False) for source in sources for e, why in seen.samples(index.of(source))]
+    known = {id(e) for e, _, _ in chosen}
+    by_pose: dict[int, list[ImageEntry]] = {}
+    for entry in index.entries:
+        pose = seen.pose_of(entry)
+        if pose is not None and id(entry) not in known:
+            by_pose.setdefault(pose, []).append(entry)
+    worst = [e for pose in _worst_poses(material) for e in by_pose.get(pose, ())][:MOST_EXTRA]
+    pictures: list[Picture] = []
+    left = BUDGET
+    for entry, why, extra in [*chosen, *((e, "chosen pose", True) for e in worst)]:
+        picture = seen.picture(entry, why, extra=extra) if left > 0 else None
+        if picture is not None:
+            left -= len(picture.jpeg_base64) + 300 * len(picture.marks)
+            pictures.append(picture)
+    if not pictures:
+        return None
+    more = sum(p.extra for p in pictures)
+    told = (
+        f" Choose a pose to see its images: those of the worst poses ({more} images) lie in this page." if more else ""
+    )
+    return Pictures(
+        tuple(pictures),
+        "Blue: ellipse with a code read, and its id. Orange: dot without code. Light blue: a ring that could not be "
+        "read. Small vermilion crosses: candidates that were refused. Green: residuals (measured minus projected), "
+        f"drawn large. Open a picture to read each mark.{told}",
+    )
 
 
 def residual_chapter(material: Material) -> Chapter:

@@ -9,6 +9,7 @@ from pipeline.report.blocks import Block, Chapter, Table, Text, table
 from pipeline.report.material import Material
 from pipeline.report.style import number, probability, to_sigma
 from robcal.calibration.identification import IdentifiedRobot
+from robcal.estimation.dependence import Eliminated
 from robcal.robot.kernel import Kernel
 from robcal.robot.model import RobotModel, parameter_unit
 from robcal.transforms import xyzrpy_from_frame
@@ -124,13 +125,38 @@ def _readable(expression: str) -> str:
     return re.sub(r"\d+\.\d{4,}(?:e[-+]?\d+)?", lambda found: f"{float(found[0]):.4g}", expression)
 
 
+_WHY = {"no influence": "no influence on any measured pose", "dependent": "others do exactly the same"}
+
+
+def _why(found: IdentifiedRobot, e: Eliminated) -> str:
+    """Why a parameter was eliminated, in words."""
+    if e.reason in _WHY:
+        return _WHY[e.reason]
+    sigma, unit = in_units(found.model, e.name, e.sigma)
+    return f"the data leave it open by {number(sigma, 2)} {unit}, more than such a part is off"
+
+
+def _tied(model: RobotModel, e: Eliminated) -> str:
+    """Changes of other parameters that do the same as one unit of this one, the strongest first."""
+    own, unit = in_units(model, e.name, 1.0)
+    told = []
+    for name, change in sorted(e.tied_to.items(), key=lambda p: -abs(p[1])):
+        other, its_unit = in_units(model, name, change)
+        same = abs(other / own - 1) < 5e-4 and its_unit == unit
+        told.append(name if same else f"{other / own:+.3g} {its_unit} {name}")
+    if not told:
+        return "nothing measured" if e.reason == "no influence" else "the parameters kept, all a little"
+    listed = ", ".join(told[:5]) + (f" and {len(told) - 5} more" if len(told) > 5 else "")
+    return listed if told[0] in e.tied_to and len(told) == 1 else f"1 {unit}: {listed}"
+
+
 def _gauges(found: IdentifiedRobot, diagnosed: bool) -> list[Block]:
     blocks: list[Block] = []
-    eliminated = found.eliminated
-    rows = []
-    for name, e in sorted(eliminated.items()):
-        ties = sorted(((n, s) for n, s in e.tied_to.items() if abs(s) > 0.05), key=lambda p: -abs(p[1]))
-        rows.append([name, str(e.reason), ", ".join(n for n, _ in ties[:6]) or "–"])
+    rows = [[name, _why(found, e), _tied(found.model, e)] for name, e in sorted(found.eliminated.items())]
+    rows += [
+        [name, f"no evidence for it (F-test, p = {probability(p)})", "nothing: taken as zero"]
+        for name, p in sorted(found.rejected_elasticities.items())
+    ]
     sentence = (
         f"{len(found.names)} parameters from {int(found.used.sum())} poses, {found.iterations} iterations in "
         f"{found.seconds:.2f} s. Condition of the scaled normal equations {number(found.condition)} (of the raw "
@@ -141,7 +167,7 @@ def _gauges(found: IdentifiedRobot, diagnosed: bool) -> list[Block]:
     if rows:
         blocks.append(
             table(
-                ["Eliminated", "Why", "Tied to (does the same as)"],
+                ["Eliminated", "Why", "Tied to: does the same as"],
                 rows,
                 "Eliminated parameters stay at their nominal values; nothing is lost within the measured poses.",
                 text=(0, 1, 2),

@@ -98,6 +98,7 @@
     if (!list) return;
     list.value = chosen === null ? "" : String(chosen);
     const shown = plots.filter((d) => chosen !== null && JSON.parse(textOf(d)).data.some((trace) => rowsOf(trace).length)).length;
+    document.getElementById("toimages").hidden = images === 0;
     told.textContent = chosen === null ? "" : `${poses[chosen]}: marked in ${shown} plots, ${rows} rows, ${images} images`;
   }
   if (list) {
@@ -131,6 +132,7 @@
   }
   if (viewer) {
     document.querySelectorAll("button.look").forEach((b) => b.addEventListener("click", () => look(b.closest("figure"))));
+    document.querySelectorAll("figure.seen > svg").forEach((s) => s.addEventListener("click", () => look(s.parentNode)));
     viewer.querySelectorAll("input[type=checkbox]").forEach((box) => box.addEventListener("change", () => viewer.classList.toggle("no-" + box.name, !box.checked)));
     viewer.querySelectorAll("button[data-zoom]").forEach((b) => b.addEventListener("click", function () {
       const picture = viewer.querySelector("svg");

@@ -247,7 +247,8 @@ def _result(
     used = weights > 0
     flange = CellEvaluator(engine.evaluator).base_T_flange
     sigma = dict(zip(solution.names, np.sqrt(scale * np.diag(statistics.cofactor)).tolist(), strict=True))
-    deficiency = describe_deficiency(kernel.model, engine.poses.q[used], flange[used], solution.eliminated, sigma)
+    eliminated = engine.tied(solution, weights)
+    deficiency = describe_deficiency(kernel.model, engine.poses.q[used], flange[used], eliminated, sigma)
     joint_sigma = np.sqrt(scale) * np.asarray(options.joint_sigma or 0.0, dtype=float)
     return IdentifiedRobot(
         model=_model_at(kernel, solution.state),
@@ -259,7 +260,7 @@ def _result(
         sigma0=sigma0,
         redundancy=redundancy,
         p_value=p_value,
-        eliminated=solution.eliminated,
+        eliminated=eliminated,
         rejected_elasticities=solution.rejected,
         condition=statistics.condition,
         condition_raw=statistics.condition_raw,

@@ -14,7 +14,7 @@ from scipy import linalg, special
 from robcal.calibration.identifiability import Candidates, check_poses, choose_by_evidence, limit_rules, limits_at
 from robcal.calibration.problem import Evaluator, Problem, State, whitening
 from robcal.errors import NotIdentifiable
-from robcal.estimation.dependence import Eliminated, split_dependent
+from robcal.estimation.dependence import Eliminated, split_dependent, with_ties
 from robcal.estimation.gauss_newton import gauss_newton
 from robcal.estimation.summary import SolveSummary, TerminationSettings
 
@@ -250,6 +250,13 @@ class Engine:
 
     def _limits(self, state: State, names: Sequence[str]) -> Array:
         return self._plausible(state, names) * (self.patience / self.scatter)
+
+    def tied(self, solution: Solution, weights: Array) -> dict[str, Eliminated]:
+        """What was eliminated, each with the parameters of the solution that do the same."""
+        gone = list(solution.eliminated.values())
+        names = [*solution.names, *(e.name for e in gone)]
+        N = self.normals(solution.state, names, weights).N
+        return {e.name: e for e in with_ties(N, names, len(solution.names), gone)}
 
     def _eliminate(
         self, state: State, names: Sequence[str], weights: Array, before: Mapping[str, Eliminated] | None = None

@@ -1,7 +1,7 @@
 """Parameters that the data cannot tell apart: elimination in an order of preference."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,6 +77,17 @@ def split_dependent(
     return kept, [Eliminated(names[d.index], d.reason, t, d.sigma) for d, t in zip(dropped, tied, strict=True)]
 
 
+def with_ties(N: Array, names: Sequence[str], kept: int, eliminated: Sequence[Eliminated]) -> list[Eliminated]:
+    """The same eliminations, each tied to the parameters that were kept in the end.
+
+    ``N`` (p, p), ``names`` (p,) : normal matrix of whitened columns, the ``kept`` ones first, then the eliminated.
+    """
+    scale = np.sqrt(np.where(np.diag(N) > 0, np.diag(N), 1.0))
+    dropped = [_Dropped(kept + k, e.reason, e.sigma) for k, e in enumerate(eliminated)]
+    tied = _ties(N, scale, names, list(range(kept)), dropped)
+    return [replace(e, tied_to=t) for e, t in zip(eliminated, tied, strict=True)]
+
+
 def _independent(N: Array, scale: Array, floor: Array, relative_pivot: float) -> tuple[list[int], list[_Dropped]]:
     """Indices whose pivots in the equilibrated matrix exceed ``relative_pivot`` and ``floor`` (p,), and the others."""
     p = len(N)
@@ -113,7 +124,7 @@ def _ties(
     N: Array, scale: Array, names: Sequence[str], kept: list[int], dropped: list[_Dropped]
 ) -> list[dict[str, float]]:
     """Changes of the kept parameters that do the same as one unit of each dropped one."""
-    if not kept:
+    if not kept or not dropped:
         return [{} for _ in dropped]
     Nk = N[np.ix_(kept, kept)] / np.outer(scale[kept], scale[kept])
     right = N[np.ix_(kept, [d.index for d in dropped])] / scale[kept][:, None]

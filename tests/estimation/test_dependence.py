@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from robcal.estimation.dependence import split_dependent
+from robcal.estimation.dependence import Eliminated, split_dependent, with_ties
 
 
 def test_dependent_columns_are_named_with_their_ties() -> None:
@@ -21,3 +21,13 @@ def test_dependent_columns_are_named_with_their_ties() -> None:
     assert by_name["f"].reason == "weak"
     assert by_name["f"].sigma == pytest.approx(1e3 / np.sqrt(40), rel=0.5)
     assert split_dependent(J.T @ J, list("abcdef"))[0] == [0, 1, 2, 5]
+
+
+def test_ties_name_parameters_that_were_kept_in_the_end() -> None:
+    J = np.random.default_rng(5).normal(size=(40, 5))
+    J[:, 3] = 2.0 * J[:, 0] - 0.5 * J[:, 1]
+    J[:, 4] = 0.0
+    gone = [Eliminated("d", "dependent", {"c": 9.0}, np.inf), Eliminated("e", "no influence", {}, np.inf)]
+    tied, none = with_ties(J.T @ J, ["a", "b", "c", "d", "e"], 3, gone)
+    assert tied.tied_to == pytest.approx({"a": 2.0, "b": -0.5})
+    assert none.tied_to == {}

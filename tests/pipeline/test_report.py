@@ -121,7 +121,7 @@ def test_the_verdict_judges_by_the_tolerance(page: Page, diagnosed: Run) -> None
 
 def test_chapters_appear_only_where_there_is_data(page: Page) -> None:
     chapters = page.chapters
-    assert chapters[:2] == ["verification", "diagnosis"]
+    assert chapters[:3] == ["verification", "workspace", "diagnosis"]
     # results stand before the evidence
     assert chapters.index("files") < chapters.index("parameters")
     assert {"measurement", "network", "files", "provenance"} <= set(chapters)
@@ -175,9 +175,15 @@ def test_other_measurements(level: str, tmp_path: Path) -> None:
 def test_images_are_embedded_with_what_was_found(image_run: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(image_run, tmp_path / "run")
     page = Page(write_report(open_run(folder)))
-    pictures = [a for t, a in page.tags if t == "img"]
+    pictures = [a for t, a in page.tags if t == "image"]
     assert pictures
-    assert all(str(a["src"]).startswith("data:image/jpeg;base64,") and a["alt"] for a in pictures)
+    assert all(str(a["href"]).startswith("data:image/jpeg;base64,") for a in pictures)
+    assert len([a for t, a in page.tags if t == "svg" and a.get("role") == "img" and a["aria-label"]]) == len(pictures)
+    marks = [a for t, a in page.tags if t == "g" and "mark" in str(a.get("class"))]
+    residuals = [a for t, a in page.tags if t == "path" and a.get("class") == "residual"]
+    assert len(marks) > len(residuals) > 10 * len(pictures) / 2
+    posed = [a for t, a in page.tags if t == "figure" and a.get("data-pose")]
+    assert len(posed) > len(pictures) / 2
     assert "images" in page.chapters
 
 
