@@ -44,7 +44,8 @@ def _figure(name: str, camera: Camera, covariance: Array, distance: float) -> li
         "name": name,
         "hovertemplate": "%{x:.0f}, %{y:.0f} px: %{z:.3g} px<extra></extra>",
     }
-    shape = layout("x (px)", "y (px)", yaxis={"autorange": "reversed", "scaleanchor": "x"})
+    tight = {"constrain": "domain"}
+    shape = layout("x (px)", "y (px)", xaxis=tight, yaxis=tight | {"autorange": "reversed", "scaleanchor": "x"})
     told = (
         f"Uncertainty of projection, {name}, at {number(distance)} m: {number(low, 2)} to {number(high, 2)} px (one "
         f"standard deviation), {number(low * micrometres, 2)} to {number(high * micrometres, 2)} µm there, without "
