@@ -53,8 +53,8 @@ def write_comparison(run: Run, other: Run) -> Path:
         "none",
         "Comparison",
         f"{str(found['statement'])[:1].upper()}{str(found['statement'])[1:]}.",
-        f"Before: {then.name}, {other.folder}. After: {now.name}, {run.folder}. Altogether as much by chance: "
-        f"p = {probability(found['p_value'])}.",
+        f"Before: {then.name}, {other.folder}. After: {now.name}, {run.folder}. Probability that "
+        f"chance alone changes as much: {probability(found['p_value'])}.",
         "Nothing from here: this page compares two runs.",
         "; ".join(found["warnings"]),
     )
@@ -75,7 +75,7 @@ def _figures(then: Material, now: Material) -> Block:
     for name, keys, unit in _ROWS:
         pair = [_value(m.result, keys) for m in (then, now)]
         if any(v is not None for v in pair):
-            rows.append([name, *(number(v) for v in pair), unit])
+            rows.append([name, *(str(v) if isinstance(v, int) else number(v) for v in pair), unit])
     return table(["", "Before", "After", "Unit"], rows, text=(0, 3))
 
 
@@ -124,6 +124,7 @@ def _changes(found: Mapping[str, Any]) -> Figure:
         "change by its sigma",
         marker={"color": [AFTER if p["p_value"] < 0.01 else BEFORE for _, p in shown]},
         text=[f"{p['change']:+.4g} {p['unit']}" for _, p in shown],
+        textposition="none",
         hovertemplate="%{x}: %{text}, %{y:.1f} sigma<extra></extra>",
     )
     return Figure(

@@ -99,7 +99,7 @@ def _with_instruments(context: Context) -> Outcome:
     except InvalidInput as error:
         raise located(error, str(campaign.path)) from None
     leading = leading_identification(found)
-    outputs = [run.save(IDENTIFICATION, leading), run.save(INSTRUMENTS, found)]
+    outputs = [run.save(IDENTIFICATION, leading), run.save(IDENTIFIED, leading.robot), run.save(INSTRUMENTS, found)]
     seen = found.seen_by(found.telling, leading.robot)
     write_robot(run.robot, seen.model, f"calibrated from campaign {campaign.name}, before the diagnosis")
     notes = [*found.notes, *instrument_notes(found, poses)]
