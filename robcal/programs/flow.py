@@ -67,10 +67,12 @@ class Flow:
     start: Active
     at: dict[int, Active] = field(default_factory=dict)
     _jumps: dict[str, Active] = field(default_factory=dict)
+    _ends: dict[tuple[str, Active], Active] = field(default_factory=dict)
 
     def walk(self, entries: Sequence[str]) -> dict[int, Active]:
         """States of all motions that the given routines and those that they call contain."""
         for _ in range(3):  # jumps back need the states of a walk before
+            self._ends.clear()
             for name in entries:
                 self._run(self.routines[name], self.start, 0, name)
         return self.at
@@ -88,7 +90,11 @@ class Flow:
         if step.kind == "move":
             self.at[step.index] = state.merged(self.at.get(step.index))
         elif step.kind == "call" and step.name in self.routines and depth < DEEPEST:
-            return self._run(self.routines[step.name], state, depth + 1, step.name)
+            key = step.name, state
+            if key not in self._ends:  # each routine once for what is in force: calls within calls would multiply
+                self._ends[key] = state  # what a call of itself leaves, as far as it is followed
+                self._ends[key] = self._run(self.routines[step.name], state, depth + 1, step.name)
+            return self._ends[key]
         elif step.kind == "jump":
             self._jumps[label] = state.merged(self._jumps.get(label))
         elif step.kind == "label":

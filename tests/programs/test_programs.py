@@ -273,3 +273,11 @@ def test_columns_of_numbers_stay_columns(kernel: Kernel) -> None:
     for line in text.splitlines():
         if " mm," in line or " deg," in line:
             assert any([m.end() for m in re.finditer(r"(mm|deg)", other)] == [m.end() for m in re.finditer(r"(mm|deg)", line)] for other in new)  # fmt: skip  # noqa: E501
+
+
+def test_routines_that_call_each_other_many_times_are_read_at_once() -> None:
+    calls = "  part()\n" * 30
+    read = read_program(
+        "urscript", Source("part.script", f"def part():\n{calls}  movej([0, 0, 0, 0, 1, 0])\n{calls}end\n")
+    )
+    assert len(read.targets) == 1
