@@ -49,6 +49,8 @@ CORRECTED_IMAGES: Artifact[Sequence[ImageFinding]] = Artifact("corrected_images"
 POINTS: Artifact[MeasuredPoints] = Artifact("points", "measure")
 FRAMES: Artifact[MeasuredFrames] = Artifact("frames", "frames")
 IDENTIFICATION: Artifact[Identification] = Artifact("identify", "identify")
+IDENTIFIED: Artifact[CalibratedRobot] = Artifact("identified", "identify")
+"""The identified robot as it is delivered where nothing is diagnosed."""
 INSTRUMENTS: Artifact[IdentifiedInstruments] = Artifact("instruments", "identify")
 """Where a campaign has several instruments, or one of whose world or tool something is known."""
 DIAGNOSED_INSTRUMENTS: Artifact[IdentifiedInstruments] = Artifact("diagnosed_instruments", "diagnose")

@@ -267,6 +267,9 @@ def compensate(
 @app.command()
 def report(
     run_folder: RunFolder,
+    compare: Annotated[
+        Path | None, typer.Option("--compare", metavar="RUN", help="Write what changed since this run as well.")
+    ] = None,
     pdf: Annotated[bool, typer.Option("--pdf", help="Print it to report.pdf as well (needs Chromium).")] = False,
     quiet: Quiet = False,
     as_json: Json = False,
@@ -275,7 +278,7 @@ def report(
     with answers("report", as_json, quiet) as answer:
         from pipeline.commands import report_again
 
-        for kind, path in report_again(run_folder, pdf=pdf).items():
+        for kind, path in report_again(run_folder, compare, pdf=pdf).items():
             answer[kind] = str(path)
             LOG.info(str(path))
 

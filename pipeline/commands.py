@@ -51,19 +51,22 @@ def diagnose_place(place: Path, out: Path | None, workers: int | None) -> tuple[
     return done, read_json(done.run.diagnosis)
 
 
-def report_again(folder: Path, *, pdf: bool = False) -> dict[str, Path]:
+def report_again(folder: Path, compare: Path | None = None, *, pdf: bool = False) -> dict[str, Path]:
     """Write the report of a run again from what lies in it; its files by kind.
 
     Raises
     ------
-    NoPrinter : a PDF is wanted, and there is no browser that prints.
+    NoPrinter : a PDF is wanted, and there is no browser that prints. InvalidInput : nothing to compare with.
     """
+    from pipeline.report.comparison import write_comparison
     from pipeline.report.pdf import print_report
     from pipeline.stages.report import write_run_report
 
     run = open_run(folder)
     with run.lock():
         files = {"report": write_run_report(run)}
+        if compare is not None:
+            files["comparison"] = write_comparison(run, open_run(compare))
         if pdf:
             files["pdf"] = print_report(run.report, run.folder / "report.pdf")
     return files

@@ -70,8 +70,8 @@ def check_images(source: str, images: ImageSource, entries: Sequence[ImageEntry]
     InvalidInput : images of several sizes, or no target in any of them.
     """
     own = [entry for entry in entries if entry.source == source]
-    usual = Counter(entry.size for entry in own).most_common(1)[0][0]
-    expected = images.size or usual
+    typical = Counter(entry.size for entry in own).most_common(1)[0][0]
+    expected = images.size or typical
     odd = [entry for entry in own if entry.size != expected]
     if odd:
         path, size = odd[0].path, odd[0].size

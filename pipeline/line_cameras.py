@@ -11,7 +11,7 @@ from robcal.files.tables import read_table, write_table
 from robcal.photogrammetry.line_cameras.calibration import calibrate
 from robcal.photogrammetry.line_cameras.camera import NUMBERS
 
-MOST_TOLD = 5
+MOST_REPORTED = 5
 
 
 def calibrate_lines(lines: Path, places: Path, out: Path) -> dict[str, Any]:
@@ -28,7 +28,7 @@ def calibrate_lines(lines: Path, places: Path, out: Path) -> dict[str, Any]:
         )
     write_line_cameras(out, found.system)
     rejected = []
-    for i in np.flatnonzero(found.rejected)[:MOST_TOLD]:
+    for i in np.flatnonzero(found.rejected)[:MOST_REPORTED]:
         camera = given.names[given.readings.camera[i]]
         rejected.append({"row": int(given.rows[i]), "camera": camera, "residual_px": float(found.residual[i])})
     sigma = np.sqrt(np.diag(found.system.covariance)).reshape(-1, len(NUMBERS))

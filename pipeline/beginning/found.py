@@ -185,8 +185,8 @@ def _separator(lines: list[str]) -> tuple[str, int]:
     """Separator, and the lines in front of the headings: those with fewer columns than most lines have."""
     best = max(SEPARATORS, key=lambda mark: sum(line.count(mark) for line in lines if mark != "," or ";" not in line))
     counts = [line.count(best) for line in lines]
-    usual = max(set(counts), key=lambda n: (n > 0, counts.count(n)))
-    return best, next((k for k, n in enumerate(counts) if n == usual), 0)
+    typical = max(set(counts), key=lambda n: (n > 0, counts.count(n)))
+    return best, next((k for k, n in enumerate(counts) if n == typical), 0)
 
 
 def _columns(headings: list[str]) -> dict[str, str]:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from pipeline.campaign import Campaign
 from pipeline.campaign_reader import read_leniently
-from pipeline.checking.images import look_into_images
+from pipeline.checking.images import image_doubts
 from pipeline.checking.joints import joint_doubts
 from pipeline.checking.measured import measured_doubts, recording_faults
 from pipeline.checking.similar_robots import robots_of_so_many_joints
@@ -36,7 +36,7 @@ _LOOKS: tuple[Callable[[Campaign], tuple[list[str], list[str]]], ...] = (
     joint_doubts,
     measured_doubts,
     survey_doubts,
-    look_into_images,
+    image_doubts,
 )
 
 

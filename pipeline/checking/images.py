@@ -9,7 +9,7 @@ import numpy as np
 
 from pipeline.campaign import Campaign, ImageSource
 from pipeline.campaign_schema import SurveyEntry
-from pipeline.checking.joints import Looked
+from pipeline.checking.joints import Doubts
 from pipeline.checking.surveys import named
 from pipeline.stages.detect import settings_for, sources
 from pipeline.tiled_images import tile_files
@@ -26,7 +26,7 @@ FEWEST_CODES = 3
 """Codes of the body that must be read among all images looked at."""
 
 
-def look_into_images(campaign: Campaign) -> Looked:
+def image_doubts(campaign: Campaign) -> Doubts:
     """Faults and doubts of all image sources."""
     faults: list[str] = []
     doubts: list[str] = []
@@ -37,7 +37,7 @@ def look_into_images(campaign: Campaign) -> Looked:
         faults += _headers(images)
         if body.board is not None or images.reseau is not None:
             continue  # found by its own detector, or tile by tile
-        wrong, doubtful = _look(source, images, body, survey)
+        wrong, doubtful = _source_doubts(source, images, body, survey)
         faults += wrong
         doubts += doubtful
     return faults, doubts
@@ -58,14 +58,14 @@ def _headers(images: ImageSource) -> list[str]:
     return faults
 
 
-def _look(source: str, images: ImageSource, body: BodyFile, survey: SurveyEntry | None) -> Looked:
+def _source_doubts(source: str, images: ImageSource, body: BodyFile, survey: SurveyEntry | None) -> Doubts:
     settings = replace(settings_for(body, survey), known_codes=None)
     paths = list(images.images.values())
     chosen = [paths[i] for i in np.unique(np.linspace(0, len(paths) - 1, LOOKED_AT).astype(int))]
     faults: list[str] = []
     seen: Counter[int] = Counter()
     sizes: dict[tuple[int, int], Path] = {}
-    dots = looked = 0
+    dots = examined = 0
     begin = time.monotonic()
     for path in chosen:
         try:
@@ -75,20 +75,20 @@ def _look(source: str, images: ImageSource, body: BodyFile, survey: SurveyEntry 
         except RobcalError as error:
             faults.append(str(error) if str(path) in str(error) else f"{path}: {error}")
             continue
-        looked += 1
+        examined += 1
         dots += len(found)
         seen.update({int(code) for code in found.code[found.code_state == CodeState.READ]})
         if time.monotonic() - begin > SECONDS:
             break
     faults += _sizes(images, sizes)
-    if not looked:
+    if not examined:
         return faults, []
     if not dots:
         return faults, [
-            f"{chosen[0].parent}: no targets found in any of the {looked} images looked at: check exposure, focus and "
-            "that these are images of the body (bright dots on dark ground unless 'polarity: dark')"
+            f"{chosen[0].parent}: no targets found in any of the {examined} images looked at: check exposure, focus "
+            "and that these are images of the body (bright dots on dark ground unless 'polarity: dark')"
         ]
-    wrong, doubtful = _codes(chosen[0].parent, seen, looked, body, survey)
+    wrong, doubtful = _codes(chosen[0].parent, seen, examined, body, survey)
     return [*faults, *wrong], doubtful
 
 
@@ -103,7 +103,7 @@ def _sizes(images: ImageSource, sizes: dict[tuple[int, int], Path]) -> list[str]
     ]
 
 
-def _codes(folder: Path, seen: Counter[int], looked: int, body: BodyFile, survey: SurveyEntry | None) -> Looked:
+def _codes(folder: Path, seen: Counter[int], examined: int, body: BodyFile, survey: SurveyEntry | None) -> Doubts:
     """Codes read against those listed: both lists where they do not fit."""
     listed = {t.id for t in body.targets if t.code not in (None, "corner", "circle") and t.id is not None}
     if not listed:
@@ -111,11 +111,11 @@ def _codes(folder: Path, seen: Counter[int], looked: int, body: BodyFile, survey
     lengths = [*(survey.scale_bars if survey else ()), *(survey.check_lengths if survey else ())]
     others = {number for length in lengths for number in length.targets}
     # a code that is read in one image alone may be a misreading
-    sure = {code for code, count in seen.items() if count > 1 or looked == 1}
+    sure = {code for code, count in seen.items() if count > 1 or examined == 1}
     strange, fitting = sorted(sure - listed - others), sorted(set(seen) & listed)
     unseen = sorted(listed - set(seen))
     lists = (
-        f"read in {looked} images: {named(sorted(seen)) or 'none'}; listed in {body.path}: {named(sorted(listed))}; "
+        f"read in {examined} images: {named(sorted(seen)) or 'none'}; listed in {body.path}: {named(sorted(listed))}; "
         f"listed but not read: {named(unseen) or 'none'}"
     )
     if len(fitting) < min(FEWEST_CODES, len(listed)):

@@ -5,7 +5,7 @@ import numpy as np
 from pipeline.campaign import Campaign
 from robcal.robot.hexapod import nominal_frames
 
-Looked = tuple[list[str], list[str]]
+Doubts = tuple[list[str], list[str]]
 """Faults that stop a run, and what is doubtful; a sentence each."""
 
 RADIANS, LEAST_MOTION = 6.5, 0.5
@@ -20,7 +20,7 @@ FEWEST_POSES = 4
 FEW_KEPT_OUT = 8
 
 
-def joint_doubts(campaign: Campaign) -> Looked:
+def joint_doubts(campaign: Campaign) -> Doubts:
     """Units, joints that stand still, poses that are few, stand twice or lie in one place."""
     poses, robot = campaign.poses, campaign.robot
     if poses is None or robot is None or not poses.q.shape[1]:

@@ -4,7 +4,7 @@ import numpy as np
 
 from pipeline.bodies import body_for_robot
 from pipeline.campaign import Campaign
-from pipeline.checking.joints import Looked
+from pipeline.checking.joints import Doubts
 from pipeline.checking.similar_robots import robots_that_fit_better
 from pipeline.runs import Run
 from pipeline.stages.identify import check_joint_limits
@@ -26,7 +26,7 @@ FEW_ROWS = 2.0
 """Numbers measured for each parameter of the geometry, base and tool, below which there is little to average."""
 
 
-def measured_doubts(campaign: Campaign) -> Looked:
+def measured_doubts(campaign: Campaign) -> Doubts:
     """Units, angles near the singularity, one orientation, few numbers, ids that nothing lists."""
     faults: list[str] = []
     doubts: list[str] = []
@@ -133,7 +133,7 @@ def _some(ids: set[int]) -> str:
     return ", ".join(map(str, named[:12])) + (f", ... ({len(named)})" if len(named) > 12 else "")
 
 
-def recording_faults(campaign: Campaign) -> Looked:
+def recording_faults(campaign: Campaign) -> Doubts:
     """Whether joint log, robot file and measurements belong together, as the identification will ask."""
     robot, poses = campaign.robot, campaign.poses
     nowhere = Run(campaign.path / "none")  # nothing has run yet

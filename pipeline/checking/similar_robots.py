@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from pipeline.campaign import Campaign
-from pipeline.checking.joints import Looked
+from pipeline.checking.joints import Doubts
 from robcal.calibration.measurements import RobotRecording
 from robcal.calibration.recording_errors.recorded import Recorded, as_frames, residual_rms
 from robcal.calibration.recording_errors.search import FEWEST_POSES, PROOF, as_robots_do
@@ -23,7 +23,7 @@ def ready_robots() -> dict[Path, RobotModel]:
     return {path: read_robot(path) for path in sorted(FOLDER.glob("*.yaml"))}
 
 
-def robots_of_so_many_joints(campaign: Campaign) -> Looked:
+def robots_of_so_many_joints(campaign: Campaign) -> Doubts:
     """Proposals where the robot file is missing, or has another number of joints than the table of poses."""
     use, robot = campaign.entry.poses, campaign.robot
     if use is None or campaign.entry.robot is None or use.table_map() is not None:
@@ -54,8 +54,8 @@ def robots_that_fit_better(robot: RobotModel, inputs: PoseInputs, recording: Rob
         return []
     frames = as_frames(recording.observations)
     own = Recorded.of(robot, inputs, frames)
-    miss = residual_rms(own)
-    if miss < as_robots_do(own):
+    residual = residual_rms(own)
+    if residual < as_robots_do(own):
         return []
     found: list[tuple[float, str]] = []
     for path, model in ready_robots().items():
@@ -63,15 +63,18 @@ def robots_that_fit_better(robot: RobotModel, inputs: PoseInputs, recording: Rob
             continue
         other = Recorded.of(model, Kernel(model).poses(inputs.q), frames)
         left = residual_rms(other)
-        if left < min(PROOF * miss, as_robots_do(other)):
+        if left < min(PROOF * residual, as_robots_do(other)):
             found.append((left, path.name))
-    misses = f"{where}: the nominal robot misses the measurements by {1e3 * miss:.3g} mm with the best base and tool"
+    residuals = (
+        f"{where}: the nominal robot misses the measurements by {1e3 * residual:.3g} mm with the best base and tool"
+    )
     if not found:
         return [
-            f"{misses}: more than robots of this size do: is it this robot, with these signs and zeros of its joints?"
+            f"{residuals}: more than robots of this size do: is it this robot, with these signs and zeros of its "
+            "joints?"
         ]
     told = _listed([f"{name} by {1e3 * left:.3g} mm" for left, name in sorted(found)])
-    return [f"{misses}, {told}: copy it from {FOLDER} if it is yours"]
+    return [f"{residuals}, {told}: copy it from {FOLDER} if it is yours"]
 
 
 def _listed(names: Sequence[str]) -> str:

@@ -4,7 +4,7 @@ import numpy as np
 
 from pipeline.campaign import BodySource, Campaign, ImageSource
 from pipeline.campaign_schema import FixedDatum, SurveyEntry
-from pipeline.checking.joints import Looked
+from pipeline.checking.joints import Doubts
 from pipeline.stages.survey import check_lengths
 from robcal.files.body_file import BodyFile
 
@@ -12,7 +12,7 @@ FEWEST_IMAGES, FEW_IMAGES = 3, 10
 MOST_NAMED = 12
 
 
-def survey_doubts(campaign: Campaign) -> Looked:
+def survey_doubts(campaign: Campaign) -> Doubts:
     """Surveys and station cameras of a campaign."""
     faults: list[str] = []
     doubts: list[str] = []
@@ -32,7 +32,7 @@ def survey_doubts(campaign: Campaign) -> Looked:
     return faults, doubts
 
 
-def _survey(where: str, body: BodySource, source: ImageSource, entry: SurveyEntry) -> Looked:
+def _survey(where: str, body: BodySource, source: ImageSource, entry: SurveyEntry) -> Doubts:
     faults: list[str] = []
     doubts: list[str] = []
     given = {t.id for t in body.file.targets if t.id is not None and t.xyz is not None}

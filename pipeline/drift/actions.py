@@ -24,7 +24,7 @@ from robcal.files.yaml_io import read_yaml
 from robcal.robot.kernel_cache import kernel_of
 from robcal.transforms import Array
 
-MOST_REJECTED_TOLD = 200
+MOST_REJECTED_REPORTED = 200
 
 
 def start(
@@ -123,7 +123,7 @@ def status(place: Path | str) -> dict[str, Any]:
             sa.select(READINGS.c.cycle, READINGS.c.pose, READINGS.c.target)
             .where(READINGS.c.use == "rejected")
             .order_by(READINGS.c.id.desc())
-            .limit(MOST_REJECTED_TOLD)
+            .limit(MOST_REJECTED_REPORTED)
         ).all()
         opened = connection.execute(
             sa.select(sa.func.count()).select_from(READINGS).where(READINGS.c.use == "open")

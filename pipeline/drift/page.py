@@ -81,7 +81,7 @@ def _parameters(rows: Sequence[Any], changes: Array, names: Sequence[str]) -> li
 
 def _html(place: Path | str, tours: Sequence[Any], alarms: Sequence[Any], figures: list[Any]) -> str:
     last = tours[-1] if tours else None
-    stands = (
+    summary = (
         f"{len(tours)} tours; the last: {last.uncorrected_mm:.3f} mm uncorrected, {last.corrected_mm:.3f} mm corrected"
         if last is not None
         else "no tour is complete yet"
@@ -109,7 +109,7 @@ def _html(place: Path | str, tours: Sequence[Any], alarms: Sequence[Any], figure
     return (
         f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{name}: drift</title>'
         "<style>body{font:16px/1.5 sans-serif;max-width:75rem;margin:2rem auto;padding:0 1rem}</style></head>"
-        f"<body><h1>Drift of {name}</h1><p>{stands}</p><h2>Alarms</h2>"
+        f"<body><h1>Drift of {name}</h1><p>{summary}</p><h2>Alarms</h2>"
         f"{f'<ul>{message}</ul>' if message else '<p>none</p>'}{plots}"
         f"<script>{get_plotlyjs()}</script><script>{script}</script></body></html>"
     )

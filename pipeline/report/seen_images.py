@@ -103,9 +103,9 @@ class SeenImages:
     def samples(self, entries: Sequence[ImageEntry]) -> Iterator[tuple[ImageEntry, str]]:
         """The usual image of a source, and the one with the fewest targets."""
         order = np.argsort([e.targets for e in entries], kind="stable")
-        usual, poor = entries[int(order[len(order) // 2])], entries[int(order[0])]
-        yield usual, "usual"
-        if poor is not usual:
+        typical, poor = entries[int(order[len(order) // 2])], entries[int(order[0])]
+        yield typical, "usual"
+        if poor is not typical:
             yield poor, "fewest targets"
 
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from pipeline.report import projection_map
 from pipeline.report.blocks import Block, Chapter, Figure, Table, Text, table
 from pipeline.report.material import Material
 from pipeline.report.style import ACCENT, AFTER, BEFORE, CATEGORIES, GREEN, GREY, label, number, rounded, scene, trace
@@ -11,6 +12,9 @@ from robcal.photogrammetry.core.network import CameraNetwork, LengthResult
 from robcal.photogrammetry.station.network import StationOrientation
 from robcal.photogrammetry.survey.types import SurveyResult
 from robcal.transforms import Array, invert
+
+ASKED = 35
+"""Lengths that VDI/VDE 2634 part 1 asks for: seven lines with five each."""
 
 
 def survey_chapter(material: Material) -> Chapter:
@@ -47,6 +51,7 @@ def _survey(name: str, survey: SurveyResult) -> list[Block]:
     blocks += _lengths([*n.check_lengths, *n.scale_bars])
     interior = np.sqrt(np.clip(np.diag(n.intrinsics_covariance), 0, None))
     blocks.append(_interior({f"survey of {name}": (n.camera, interior)}))
+    blocks += projection_map.of_survey(name, n)
     if n.correlations:
         pairs = [[c.first, c.second, f"{c.value:+.3f}"] for c in sorted(n.correlations, key=lambda c: -abs(c.value))]
         blocks.append(
@@ -81,6 +86,8 @@ def _lengths(lengths: list[LengthResult]) -> list[Block]:
         if checks
         else "There are no check lengths: give some to have the scale verified after VDI/VDE 2634-1."
     )
+    if checks and len(checks) < ASKED:
+        word += f" The guideline asks for seven lines of five lengths ({ASKED}): E is told by these alone."
     return [
         table(
             ["Length", "Targets", "Known (mm)", "Error (mm)", "Sigma (mm)", "Error / sigma"],
@@ -119,6 +126,7 @@ def _station(station: StationOrientation) -> list[Block]:
         for name, camera in zip(station.names, station.cameras, strict=True)
     }
     blocks.append(_interior(sigmas))
+    blocks += projection_map.of_station(station)
     return blocks
 
 
@@ -200,11 +208,11 @@ def _network(name: str, network: CameraNetwork) -> Figure:
 
 def _station_scene(station: StationOrientation, material: Material) -> Figure:
     centres = station.world_T_body[:, :3, 3]
-    stands = station.world_T_exterior
-    extent = float(np.median(np.linalg.norm(centres - stands[0][:3, 3], axis=1)))
+    world_T_camera = station.world_T_exterior
+    extent = float(np.median(np.linalg.norm(centres - world_T_camera[0][:3, 3], axis=1)))
     data = [
         _lines(
-            _camera_lines(stands[station.exterior_camera == c], 0.06 * extent),
+            _camera_lines(world_T_camera[station.exterior_camera == c], 0.06 * extent),
             f"camera {name}",
             CATEGORIES[c % len(CATEGORIES)],
             4,
@@ -218,7 +226,7 @@ def _station_scene(station: StationOrientation, material: Material) -> Figure:
     names = [material.pose_name(int(p)) for p in station.poses]
     data.append(_dots(centres, names, "measured poses", GREEN, 3, station.poses))
     # the cameras' own upward direction, or the robot's where it is known
-    up = -stands[0][:3, 1]
+    up = -world_T_camera[0][:3, 1]
     if material.calibrated is not None and material.calibrated.model.world_T_base is not None:
         up = np.asarray(material.calibrated.model.world_T_base)[:3, 2]
     return Figure(

@@ -150,19 +150,19 @@ def _draft(path: Path, codes: Counter[int], dots: list[int], polarity: str) -> P
     needed = _SEEN if len(dots) >= 3 else 1
     kept = sorted(code for code, count in codes.items() if count >= needed)
     once = sorted(code for code, count in codes.items() if count < needed)
-    usual = int(np.median(dots)) if dots else 0
+    typical = int(np.median(dots)) if dots else 0
     rows: list[dict[str, Any]] = []
     for code in kept:
         row: dict[str, Any] = FlowMapping(id=code, code="ring12", diameter_mm=None, xyz_mm=None)
         rows.append(row)
-    rows += [FlowMapping(id=None, code=None, diameter_mm=None, xyz_mm=None) for _ in range(usual)]
+    rows += [FlowMapping(id=None, code=None, diameter_mm=None, xyz_mm=None) for _ in range(typical)]
     if not rows:
         raise InvalidInput(
             f"{path.parent}: no target was read in any image: the pictures there show what was refused and why; for a "
             "board or square markers state its body file with --body"
         )
     comment = (
-        f"draft from {len(dots)} images: {len(kept)} codes read in {needed} or more, {usual} dots without (median)\n"
+        f"draft from {len(dots)} images: {len(kept)} codes read in {needed} or more, {typical} dots without (median)\n"
         "complete it: diameter_mm of the dots, xyz_mm where coordinates are known; remove what is not on the body"
     )
     if once:

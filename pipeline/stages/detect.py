@@ -26,6 +26,7 @@ from robcal.photogrammetry.tiles.transformation import Reseau
 from robcal.recipe.detection import detection_settings
 
 NAME = "detect"
+CIRCLES = ("circles", "asymmetric_circles")
 
 
 @dataclass(frozen=True)
@@ -92,6 +93,19 @@ def _detect(job: _Job) -> ImageEntry:
     )
 
 
+def board_notes(body: BodyFile) -> list[str]:
+    """What a board's file leaves open."""
+    notes, board = [], body.board
+    if board is not None and board.turns > 1:
+        notes.append(f"{body.path}: {board.same_when_turned}")
+    if board is not None and board.kind in CIRCLES and board.diameter is None:
+        notes.append(
+            f"{body.path}: the circles state no diameter_mm: their centres are not corrected for perspective, which "
+            "moves tilted ones by hundredths of a pixel and more: measure one and state it"
+        )
+    return notes
+
+
 def work(context: Context) -> Outcome:
     """Detect targets in all images of the campaign."""
     campaign, run = context.campaign, context.run
@@ -116,11 +130,7 @@ def work(context: Context) -> Outcome:
     notes = [
         note for source, (images, _, _) in sources(campaign).items() for note in check_images(source, images, entries)
     ]
-    notes += [
-        f"{body.path}: {body.board.same_when_turned}"
-        for _, body, _ in sources(campaign).values()
-        if body.board is not None and body.board.turns > 1
-    ]
+    notes += [note for _, body, _ in sources(campaign).values() for note in board_notes(body)]
     notes += [entry.message for entry in entries if entry.targets and entry.message]
     index = DetectionIndex(tuple(entries))
     path = run.save(DETECTED, index)

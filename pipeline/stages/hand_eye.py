@@ -199,7 +199,7 @@ def _outcome(campaign: Campaign, run: Run, kept: HandEyeRun, notes: list[str]) -
         "converged": found.summary.converged,
     }
     message = [*notes, *(f"image '{r['image']}' is left out: {r['reason']}" for r in rejected), *found.notes]
-    message += [str(c["statement"]) for c in causes] + _shape_notes(found)
+    message += [str(c["statement"]) for c in causes] + _shape_notes(found, kept.data.body)
     if not found.summary.converged:
         message.append(f"the adjustment did not converge: {found.summary.termination}")
     whole: dict[str, Any] = {NAME: result}
@@ -223,13 +223,19 @@ def _noise(kept: HandEyeRun) -> dict[str, float]:
     }
 
 
-def _shape_notes(found: HandEye) -> list[str]:
+def _shape_notes(found: HandEye, body: Body) -> list[str]:
     notes = []
     if "scale" in found.shape:
         share, sigma = 100 * found.shape["scale"], 100 * found.shape_sigma["scale"]
         notes.append(
             f"the board is {abs(share):.3f} +- {sigma:.3f} per cent {'larger' if share > 0 else 'smaller'} than its "
             "file says (or the robot's lengths are that much off): measure it, and correct the file"
+        )
+        # the scale is estimated about the middle of the board, so its frame keeps the origin of the stated size
+        off = 1e3 * abs(found.shape["scale"]) * float(np.linalg.norm(body.points[body.known].mean(axis=0)))
+        notes.append(
+            f"the origin of the board's frame is that of the stated size and lies {off:.2g} mm from the corner of the "
+            "real board: run again with the corrected file before the board's frame is used"
         )
     if "bend_xx" in found.shape:
         notes.append("the board is not flat: its bend is estimated with the camera; a stiff board would be better")

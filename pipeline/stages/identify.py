@@ -4,7 +4,17 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.artifacts import ADJUSTED, CALIBRATED, DIAGNOSED_INSTRUMENTS, HAND_EYE, IDENTIFICATION, INSTRUMENTS
+from pipeline.artifacts import (
+    ADJUSTED,
+    CALIBRATED,
+    DIAGNOSED_INSTRUMENTS,
+    HAND_EYE,
+    IDENTIFICATION,
+    IDENTIFIED,
+    INSTRUMENTS,
+    ORIENTATION,
+    POINTS,
+)
 from pipeline.bodies import body_for_robot
 from pipeline.campaign import Campaign
 from pipeline.instrument_results import instrument_notes, instruments_result
@@ -25,6 +35,7 @@ from robcal.files.schemas import proposal
 from robcal.photogrammetry.survey.given_coordinates import GivenCoordinates
 from robcal.recipe.identification import identify_robot
 from robcal.recipe.instruments import leading_identification
+from robcal.recipe.robot_diagnosis import Measured, undiagnosed
 from robcal.recipe.wires import identify_with_corrections
 from robcal.robot.kernel import Kernel
 from robcal.robot.model import RobotModel
@@ -66,7 +77,11 @@ def work(context: Context) -> Outcome:
         found = identify_robot(robot, poses, recording, options_of(campaign, recording.stated))
     except InvalidInput as error:
         raise located(error, str(poses.path)) from None
-    outputs = [run.save(IDENTIFICATION, found)]
+    alone: CalibratedRobot = found.robot
+    if not campaign.entry.diagnosis.enabled:
+        measured = Measured(body_for_robot(campaign, run), run.find(POINTS), run.find(ORIENTATION))
+        alone = undiagnosed(found, poses, measured)
+    outputs = [run.save(IDENTIFICATION, found), run.save(IDENTIFIED, alone)]
     write_robot(run.robot, found.robot.model, f"calibrated from campaign {campaign.name}, before the diagnosis")
     notes = [*found.recording.notes, *_notes(found.robot, poses, found.rows)]
     return Outcome({"identification": _result(found.robot, found.rows)}, outputs, notes)
@@ -84,7 +99,7 @@ def _with_instruments(context: Context) -> Outcome:
     except InvalidInput as error:
         raise located(error, str(campaign.path)) from None
     leading = leading_identification(found)
-    outputs = [run.save(IDENTIFICATION, leading), run.save(INSTRUMENTS, found)]
+    outputs = [run.save(IDENTIFICATION, leading), run.save(IDENTIFIED, leading.robot), run.save(INSTRUMENTS, found)]
     seen = found.seen_by(found.telling, leading.robot)
     write_robot(run.robot, seen.model, f"calibrated from campaign {campaign.name}, before the diagnosis")
     notes = [*found.notes, *instrument_notes(found, poses)]
@@ -208,6 +223,8 @@ def load_calibrated(run: Run, instrument: str | None = None) -> CalibratedRobot:
     """
     adjusted = run.find(ADJUSTED)
     robot: CalibratedRobot | None = run.find(CALIBRATED) if adjusted is None else adjusted.robot
+    if robot is None:
+        robot = run.find(IDENTIFIED)
     identified = run.find(IDENTIFICATION)
     if robot is None and identified is not None:
         robot = identified.robot
@@ -240,7 +257,7 @@ STAGE = Stage(
     inputs=lambda campaign: [
         p for p in campaign.files if p.suffix.lower() in {".csv", ".yaml", ".yml", ".urdf", ".xml", ".py"}
     ],
-    settings=lambda campaign: campaign.entry.model_dump(include=SETTINGS),
+    settings=lambda campaign: [campaign.entry.model_dump(include=SETTINGS), campaign.entry.diagnosis.enabled],
     after=("survey", "measure", "frames"),
     module=__name__,
 )

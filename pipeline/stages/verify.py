@@ -76,7 +76,8 @@ def work(context: Context) -> Outcome:
         )
     diagnosis = read_json(run.diagnosis) if diagnosed and run.diagnosis.is_file() else None
     recording = identification.recording
-    wrong = [] if instruments is not None else disagreements(found, calibrated, poses, recording, diagnosis)
+    said = diagnosis if relative is None else None  # the diagnosis speaks of the robot before the joint adjustment
+    wrong = [] if instruments is not None else disagreements(found, calibrated, poses, recording, said)
     doubts = doubtful_coordinates(run)
     noise = noise_of(identification, calibrated, poses)
     facts = robot_facts(identification, calibrated, poses, found.delivered, diagnosis, doubts, wrong)

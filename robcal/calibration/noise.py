@@ -20,7 +20,7 @@ from robcal.robot.kernel import PoseInputs
 Array = NDArray[np.float64]
 
 NO_SCATTER = -700.0
-BELOW, ABOVE, LOOKS = 8.0, 10.0, 8
+BELOW, ABOVE, GRID_POINTS = 8.0, 10.0, 8
 """Range of the logarithm of the ratio around equal shares, and looks in it before the minimum is refined."""
 
 
@@ -126,11 +126,11 @@ def restricted_components(blocks: Iterable[tuple[Array, Array, Array]]) -> Compo
     none = profile(NO_SCATTER)
     middle = -np.log(max(float(np.mean(values)), 1e-300))
     # the likelihood may have a second hill: a coarse look first
-    grid = np.linspace(middle - BELOW, middle + ABOVE, LOOKS)
+    grid = np.linspace(middle - BELOW, middle + ABOVE, GRID_POINTS)
     k = int(np.argmin([profile(float(x))[0] for x in grid]))
     found = optimize.minimize_scalar(
         lambda x: profile(x)[0],
-        bounds=(grid[max(0, k - 1)], grid[min(LOOKS - 1, k + 1)]),
+        bounds=(grid[max(0, k - 1)], grid[min(GRID_POINTS - 1, k + 1)]),
         method="bounded",
         options={"xatol": 1e-2},
     )

@@ -22,7 +22,7 @@ from robcal.physics.cause import ObservationCause
 from robcal.robot.model import RobotModel
 
 DEFAULTS = SelectionSettings()
-MOST_BESIDE_CURVES = 4
+MOST_WITH_CURVES = 4
 """Causes that are looked for beside irregular curves of the joints: what these leave is small."""
 MOST_POSES = 200
 """Poses on which a search is done; the final fit takes all."""
@@ -149,7 +149,7 @@ def _searched(case: _Case, curves: Curves) -> _Found:
         # has. They are an effect that was left out, so the search without the optional parameters is the one to do.
         model = model.with_terms(curves.frozen)
         weighted = estimate_noise(model, case.thin, free).apply(case.thin)
-        few = replace(case.settings, most=min(case.settings.most, MOST_BESIDE_CURVES))
+        few = replace(case.settings, most=min(case.settings.most, MOST_WITH_CURVES))
         return _Found(select(model, weighted, free, case.tied, few, case.notify), model, free)
     weighted = estimate_noise(case.model, case.thin, case.free).apply(case.thin)
     chosen = select(case.model, weighted, case.free, case.tied, case.settings, case.notify)

@@ -53,9 +53,9 @@ def separating_poses(
         normal = normals[weakest]
         ridge = 1e-12 * np.diag(np.diag(normal)) + 1e-18 * np.eye(len(normal))
         inverse = np.linalg.pinv(normal + ridge, rcond=1e-14, hermitian=True)
-        miss = own_there - columns @ (inverse @ rights[weakest])
+        residual = own_there - columns @ (inverse @ rights[weakest])
         leverage = (columns @ inverse) @ columns.swapaxes(1, 2) + np.eye(6)
-        score = np.einsum("nk,nk->n", miss, np.linalg.solve(leverage, miss[:, :, None])[:, :, 0])
+        score = np.einsum("nk,nk->n", residual, np.linalg.solve(leverage, residual[:, :, None])[:, :, 0])
         score[taken] = -1.0
         best = int(np.argmax(score))
         taken.append(best)

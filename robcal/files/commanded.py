@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from robcal.calibration.joint_log import RESTING, approach_from_order
 from robcal.errors import InvalidInput
 from robcal.files.measurement_tables import MeasuredTable
-from robcal.files.poses_table import LIMIT_SLACK, Poses, joint_columns
+from robcal.files.poses_table import LIMIT_TOLERANCE, Poses, joint_columns
 from robcal.files.tables import Table
 from robcal.robot.model import RobotModel
 from robcal.transforms import Array
@@ -37,7 +37,7 @@ def commanded_angles(table: Table, robot: RobotModel | None) -> Array | None:
     for k, ((name, factor), joint) in enumerate(zip(joints, robot.joints, strict=True)):
         low, high = joint.limits or (-np.inf, np.inf)
         table.refuse(
-            (q[:, k] < low - LIMIT_SLACK) | (q[:, k] > high + LIMIT_SLACK),
+            (q[:, k] < low - LIMIT_TOLERANCE) | (q[:, k] > high + LIMIT_TOLERANCE),
             lambda i, name=name, joint=joint, k=k, factor=factor: (  # type: ignore[misc]
                 f"{name} = {q[i, k] / factor:g} lies outside the range of {joint.name}: correct the angle, or the "
                 "range in the robot file"

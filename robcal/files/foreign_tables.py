@@ -18,7 +18,7 @@ import numpy as np
 from robcal.errors import InvalidInput
 from robcal.files.schemas import proposal
 from robcal.files.storage import read_bytes
-from robcal.files.tables import MAX_BYTES, MAX_ROWS, MOST_TOLD, FaultyRows, Table
+from robcal.files.tables import MAX_BYTES, MAX_ROWS, MOST_REPORTED, FaultyRows, Table
 from robcal.transforms import Array, exp_so3, rotation_from_rpy, rpy_from_rotation
 
 Orientation = Literal["rpy", "intrinsic_zyx", "abc", "quaternion", "rotation_vector"]
@@ -78,7 +78,7 @@ def read_mapped_table(path: Path, use: TableMap) -> Table:
         faults = [
             f"{path}, row {rows[k]}: has {len(records[k])} cells where there are {width} columns: check 'sep' and "
             "'decimal'"
-            for k in ragged[:MOST_TOLD]
+            for k in ragged[:MOST_REPORTED]
         ]
         raise FaultyRows(faults, table)
     return table

@@ -169,12 +169,12 @@ def _rtde(path: Path, text: str) -> Table:
     if time is None or len(time) < 3 or float(np.median(np.diff(time))) > DENSE:
         found = [_Found(int(row), None, tuple(map(float, values))) for row, values in zip(table.rows, q, strict=True)]
         return _table(path, found)
-    stands = standstills(time, np.radians(q))
-    if not stands:
+    rests = standstills(time, np.radians(q))
+    if not rests:
         raise InvalidInput(f"{path}: the robot never stands still for {SHORTEST:g} s: record the poses at rest")
-    found = [_Found(int(table.rows[a]), None, tuple(map(float, q[a:b].mean(axis=0)))) for a, b in stands]
+    found = [_Found(int(table.rows[a]), None, tuple(map(float, q[a:b].mean(axis=0)))) for a, b in rests]
     made = _table(path, found)
-    seconds = tuple(repr(float(time[a:b].mean())) for a, b in stands)
+    seconds = tuple(repr(float(time[a:b].mean())) for a, b in rests)
     return Table(path, {**made.columns, "time_s": seconds}, made.rows)
 
 

@@ -17,7 +17,7 @@ from robcal.robot.loops import closing
 from robcal.robot.model import RobotModel
 from robcal.transforms import Array
 
-LIMIT_SLACK = 1e-3
+LIMIT_TOLERANCE = 1e-3
 """Poses may lie this much (rad or m) beyond a limit: controllers round."""
 LONGEST_STEP = 3600.0
 """Time (s) from one pose to the next that no recording takes as a rule."""
@@ -176,7 +176,7 @@ def _outside(table: Table, robot: RobotModel, q: Array) -> str:
         if joint.limits is None:
             continue
         low, high = joint.limits
-        outside = (q[:, k] < low - LIMIT_SLACK) | (q[:, k] > high + LIMIT_SLACK)
+        outside = (q[:, k] < low - LIMIT_TOLERANCE) | (q[:, k] > high + LIMIT_TOLERANCE)
         if outside.any():
             i = int(np.argmax(outside))
             unit = "mm" if joint.prismatic else "deg"
@@ -265,10 +265,10 @@ def _doubtful_times(file: str, time_s: Array) -> list[str]:
     steps = np.diff(time_s)
     notes = []
     if len(steps) and float(np.median(steps)) > LONGEST_STEP:
-        usual = float(np.median(steps))
+        typical = float(np.median(steps))
         notes.append(
-            f"column 'time_s' of {file}: {usual:.0f} s from one pose to the next: these look like milliseconds "
-            f"({usual / 1000:.0f} s then): divide by 1000"
+            f"column 'time_s' of {file}: {typical:.0f} s from one pose to the next: these look like milliseconds "
+            f"({typical / 1000:.0f} s then): divide by 1000"
         )
     if (steps < 0).any():
         notes.append(f"column 'time_s' of {file} runs back at row {int(np.argmax(steps < 0)) + 3}: check the clock")

@@ -169,8 +169,8 @@ def parse_leniently(document: YamlDocument, schema: type[E], file_format: str) -
             and not (problem["type"] == "missing" and (*place, problem["loc"][-1]) in left_out)  # told already
         ]
         left_out |= {_entry_of(place) for problem, place, _ in problems if problem["type"] != "unknown_key"}
-        mended = [_mend(data, place, problem) for problem, place, _ in problems]
-        if not all(mended):
+        corrected = [_corrected(data, place, problem) for problem, place, _ in problems]
+        if not all(corrected):
             break
     return None, faults
 
@@ -199,7 +199,7 @@ def _entry_of(place: Place) -> Place:
     return place
 
 
-def _mend(data: dict[str, Any], place: Place, problem: ErrorDetails) -> bool:
+def _corrected(data: dict[str, Any], place: Place, problem: ErrorDetails) -> bool:
     """Rename a misspelt key, or leave out the entry of a problem; false where that is not possible."""
     if problem["type"] == "unknown_key":
         holder = _inside(data, place)

@@ -23,7 +23,7 @@ from robcal.transforms import Array
 MAX_BYTES = 400_000_000
 MAX_ROWS = 5_000_000
 MAX_CELL = 10_000
-MOST_TOLD = 20
+MOST_REPORTED = 20
 """Faulty rows of one kind that are listed."""
 MISSING = frozenset({"", "nan", "na", "n/a", "null", "none", "-"})
 
@@ -78,9 +78,9 @@ class Table:
         """
         records = np.flatnonzero(bad)
         if len(records):
-            faults = [self._located(int(i), message(int(i))) for i in records[:MOST_TOLD]]
-            if len(records) > MOST_TOLD:
-                faults.append(f"{self.path}: {len(records) - MOST_TOLD} more rows like these")
+            faults = [self._located(int(i), message(int(i))) for i in records[:MOST_REPORTED]]
+            if len(records) > MOST_REPORTED:
+                faults.append(f"{self.path}: {len(records) - MOST_REPORTED} more rows like these")
             raise FaultyRows(faults, self.without(records))
 
     def without(self, records: ArrayLike) -> "Table":
@@ -225,7 +225,7 @@ def read_table(path: Path) -> Table:
     columns = {name: tuple(cells) for name, cells in zip(header, by_column, strict=True)}
     table = Table(path, columns, np.array(rows, dtype=np.int64))
     if ragged:
-        raise FaultyRows(ragged[:MOST_TOLD], table)
+        raise FaultyRows(ragged[:MOST_REPORTED], table)
     return table
 
 

@@ -55,9 +55,9 @@ def _belongs_to(fit: Fit, image: int, used: BoolArray) -> int | None:
     X, Z = state.X[None, of_X], state.Z[None, of_Z]
     errors = np.array([image_errors(replace(alone, base_T_flange=F[None]), state.camera, X, Z)[0, 0] for F in flanges])
     errors[image] = np.inf
-    usual = float(np.nanmax(fit.image_px()[used]))
+    typical = float(np.nanmax(fit.image_px()[used]))
     best = int(np.argmin(errors))
-    return best if errors[best] <= 2.0 * usual else None
+    return best if errors[best] <= 2.0 * typical else None
 
 
 def held_out(fit: Fit, used: BoolArray, kept_out: BoolArray) -> HeldOut | None:

@@ -22,7 +22,9 @@ class JointAdjustment:
     robot : with the covariance that cameras and body have a part in; its joints scatter as estimated.
     orientation : the station with its cameras, covariance, body and noise as adjusted now. The linearised model inside
         is still that of the station by itself.
-    relative : (p, p) covariance of its parameters against frames that the cameras as adjusted measure.
+    relative : (p, p) covariance of its parameters with cameras and body as they were found.
+    covariance : (g + p, g + p) of everything: exterior and interior orientations as in the covariance of
+        ``orientation``, coordinates of the body, parameters of the robot.
     joint_sigma : (N,) scatter of the joints, rad or m: what they do not repeat and what the model lacks.
     loose : rows of the joint log of poses found not to stand where the robot's joints say.
     rejected : marks left out beside those that the station left out.
@@ -33,6 +35,7 @@ class JointAdjustment:
     robot: CalibratedRobot
     orientation: StationOrientation = field(repr=False)
     relative: Array = field(repr=False)
+    covariance: Array = field(repr=False)
     joint_sigma: Array
     loose: tuple[int, ...]
     rejected: tuple[RejectedMark, ...]
@@ -86,10 +89,12 @@ def result_of(
         covariance_scale=1.0,
         joint_sigma=problem.joint_sigma.tolist(),
     )
+    covariance = _by_numbers(problem, state, found.shared)
     return JointAdjustment(
         robot=adjusted,
-        orientation=_oriented(problem, state, found, orientation, rejected),
+        orientation=_oriented(problem, state, covariance, orientation, rejected),
         relative=found.robot_alone,
+        covariance=covariance,
         joint_sigma=problem.joint_sigma,
         loose=tuple(sorted(loose)),
         rejected=tuple(rejected),
@@ -101,27 +106,34 @@ def result_of(
     )
 
 
+def _by_numbers(problem: JointProblem, state: JointState, shared: Array) -> Array:
+    """(g + p, g + p) covariance of all unknowns of station and robot, zero for those held; interiors as numbers."""
+    g, p = len(problem.active), len(problem.columns)
+    e = problem.counts[0]
+    by_unknown = np.eye(g + p)
+    for i, basis in enumerate(interior_basis(state.station.interior)):
+        at = slice(6 * e + 9 * i, 6 * e + 9 * i + 9)
+        by_unknown[at, at] = basis
+    on = np.concatenate([np.flatnonzero(problem.active), np.arange(g, g + p)])
+    J = by_unknown[:, on]
+    return np.asarray(J @ shared @ J.T)
+
+
 def _oriented(
     problem: JointProblem,
     state: JointState,
-    found: Cofactors,
+    covariance: Array,
     orientation: StationOrientation,
     rejected: list[RejectedMark],
 ) -> StationOrientation:
-    """The station as adjusted with the robot."""
-    on, g, x = np.flatnonzero(problem.active), len(problem.active), state.station
-    whole = np.zeros((g, g))
-    whole[np.ix_(on, on)] = found.shared[: len(on), : len(on)]
+    """The station as adjusted with the robot; ``covariance`` of its numbers, then of the robot's."""
+    g, x = len(problem.active), state.station
     e, c = problem.counts
     size = 6 * e + 9 * c
-    to_numbers = np.eye(size)
-    for i, basis in enumerate(interior_basis(x.interior)):
-        at = slice(6 * e + 9 * i, 6 * e + 9 * i + 9)
-        to_numbers[at, at] = basis
     seen = np.isin(np.arange(len(x.points)), problem.marks.target)
     both = np.repeat(seen, 3)
     before = orientation.body.covariance
-    C = whole[size:, size:]
+    C = covariance[size:g, size:g]
     if before is not None:
         C = np.where(np.outer(~both, ~both), before, C)
     body = replace(orientation.body, points=np.where(seen[:, None], x.points, orientation.body.points), covariance=C)
@@ -129,7 +141,7 @@ def _oriented(
         orientation,
         cameras=tuple(camera.with_vector(x.interior[i]) for i, camera in enumerate(problem.cameras)),
         world_T_exterior=x.world_T_exterior,
-        covariance=to_numbers @ whole[:size, :size] @ to_numbers.T,
+        covariance=covariance[:size, :size],
         body=body,
         noise=dict(zip(orientation.names, map(float, problem.noise), strict=True)),
         rejected=(*orientation.rejected, *rejected),

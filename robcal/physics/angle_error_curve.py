@@ -44,7 +44,7 @@ def periodic_curve(joint: Joint, angles: Array, bumps: int) -> RobotCause:
     return _cause((Placed(joint),), angles, bumps, joint.where, sentence)
 
 
-def beside_shared(cause: RobotCause, size: float) -> RobotCause:
+def difference_from_shared(cause: RobotCause, size: float) -> RobotCause:
     """The curve of a joint as what it differs by from the one that it shares, `size` times as large as a curve."""
     sentence = "The curve of {where} differs by {rms_deg:.4f} deg RMS from the one that joints share"
     return replace(cause, sentence=sentence, default_prior=size * CURVE_PRIOR)

@@ -24,12 +24,12 @@ def _approach_size(site: RobotSite, joint: Joint) -> Iterator[RobotCause]:
     name = f"move{joint.number}"
     if not site.varies(name, 1e-6):
         return
-    usual = float(np.sqrt(np.mean(site.variables[name] ** 2)))
+    typical = float(np.sqrt(np.mean(site.variables[name] ** 2)))
     yield RobotCause(
         APPROACH_SIZE,
         *joint.place,
         ("share",),
-        (TYPICAL / usual,),
+        (TYPICAL / typical,),
         lambda v, c: {"deg_per_deg": float(v[0])},
         bases=lambda c: (Basis(joint.frame, "q", name, "share"),),
         covariates=(name,),

@@ -36,8 +36,8 @@ def disagreements(
     out = []
     if found.delivered.kind == "verify-set" and not found.at_home:
         T, _ = robot.predict(robot.inputs(log.as_stated()).subset(found.rows))
-        miss = float(np.sqrt(np.mean(tool_errors(T, recording.select(found.rows))["0"][1] ** 2)))
-        out += _unequal("the delivered error", reported, "what predict gives", miss)
+        residual = float(np.sqrt(np.mean(tool_errors(T, recording.select(found.rows))["0"][1] ** 2)))
+        out += _unequal("the delivered error", reported, "what predict gives", residual)
     if not diagnosis or diagnosis.get("heldout_mm") is None:
         return out
     after = diagnosis["heldout_mm"].get("after")

@@ -91,7 +91,7 @@ def evidence_of(
     before = fit(model, recording, free)
     # pose by pose: errors common to all poses are taken off as they were estimated
     alone = replace(clean, common=None)
-    analyses = [(tangents(after, alone), clean.beside_common(after.residual), alone, False)]
+    analyses = [(tangents(after, alone), clean.given_common(after.residual), alone, False)]
     if verify is not None:
         tested = relabelled(verify, swaps)
         there, alone = _elsewhere(after, tested), replace(tested, common=None)

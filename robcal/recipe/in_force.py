@@ -153,7 +153,7 @@ def choose(recording: Recording, log: JointLog, rows: Rows, bare: Form, extended
     inferred and cost nothing without.
     """
     folds = Folds(recording, log, rows)
-    chosen, reasons, measuring = _beside_faults(folds, bare, extended.direct)
+    chosen, reasons, measuring = _with_faults(folds, bare, extended.direct)
     waits: dict[str, str] = {}
     if groups := groups_of(bare, extended):
         chosen, message, waits = with_terms(folds, chosen, replace(extended, direct=chosen.direct), groups)
@@ -163,7 +163,7 @@ def choose(recording: Recording, log: JointLog, rows: Rows, bare: Form, extended
     return InForce(chosen, chosen is not bare, whole.before, whole.after, reason, waits, measuring)
 
 
-def _beside_faults(folds: Folds, bare: Form, direct: Sequence[Accepted]) -> tuple[Form, list[str], str]:
+def _with_faults(folds: Folds, bare: Form, direct: Sequence[Accepted]) -> tuple[Form, list[str], str]:
     """The form beside faults of the measuring system that are beyond doubt, reasons, and why others are left."""
     if not direct:
         return bare, [], ""
@@ -192,7 +192,7 @@ def with_terms(folds: Judge, base: Form, full: Form, groups: Groups) -> tuple[Fo
     if len(unpaid) < len(groups):
         trial = full.without([name for group in unpaid for name in groups[group]])
         found, weighted = folds.gain(base, trial, stated)
-        pays = found.pays_beside(weighted)
+        pays = found.pays_jointly(weighted)
         reasons.append(_gain_statement("terms of the robot", found, pays, weighted))
         part, unpaid = (trial, unpaid) if pays else (base, dict.fromkeys(groups, found))
     waits: dict[str, str] = {}
@@ -218,7 +218,7 @@ def _with_approach(
         return part, [], {}
     trial = full.without([name for group in unpaid if group in known for name in groups[group]])
     found, weighted = folds.gain(part, trial, folds.log)
-    if not found.pays_beside(weighted):
+    if not found.pays_jointly(weighted):
         return part, [], {}
     message = f"with approach directions stated the error over blocked folds is {_errors(found, 'them')}"
     cost, _ = folds.gain(part, trial, folds.log.as_stated())
@@ -251,7 +251,7 @@ def groups_of(bare: Form, extended: Form) -> Groups:
 
 def not_paying(full: Delivers, groups: Groups, fold: Array) -> dict[str, Gain]:
     """Groups that do not pay beside those that stay, and the gain of each: backward, the most useless one first."""
-    return _backward(full, groups, fold, lambda plain, weighted: plain.pays_beside(weighted))
+    return _backward(full, groups, fold, lambda plain, weighted: plain.pays_jointly(weighted))
 
 
 def contradicted(full: Delivers, groups: Groups, fold: Array) -> dict[str, Gain]:

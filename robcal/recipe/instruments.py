@@ -53,7 +53,7 @@ def identify_from_instruments(
     instruments, reported = with_determined_orientations(Kernel(start), log, instruments)
     notes += reported
     found = identify_instruments(start, log, instruments, options)
-    found = replace(found, notes=(*found.notes, *wire_alarms(found, log, options)))
+    found = replace(found, notes=(*found.notes, *wire_alarms(start, found, log, options)))
     unstated = [i.name for i in instruments if not i.recording.stated]
     if unstated:
         notes.append(f"{' and '.join(unstated)}: no uncertainty is stated, it is estimated from the residuals")

@@ -139,7 +139,7 @@ def delivered(anew: Anew, reported: Sequence[ReportedCause], not_separable: tupl
         # the law of a search is linear: what it needed beside the right cause the exact one does not
         needless = [t for t in reported if _is_needless(t, again)]
         if not needless:
-            folds = InstrumentFolds(again, anew.log, options)
+            folds = InstrumentFolds(start, again, anew.log, options)
             groups = _groups(reported, again)
             weak = contradicted_groups(
                 folds, {k: names for k, names in groups.items() if names and not reported[int(k)].by_priors}

@@ -81,7 +81,9 @@ def diagnose_instruments(
     reported = [ReportedCause(f, name) for name, d in own.items() for f in d.findings]
     reported = _distinct([_compared(t, cases) for t in reported])
     reported += [
-        t for n, c in cases.items() if c.recording.hidden and (t := _scale_of(n, c, found, log, options, reported))
+        t
+        for n, c in cases.items()
+        if c.recording.hidden and (t := _scale_of(n, c, model, found, log, options, reported))
     ]
     anew = Anew(model, found, instruments, log, options or IdentifyOptions(), corrections or {}, own)
     return delivered(anew, reported, tuple(not_separable))
@@ -136,6 +138,7 @@ def _lengths_are_believed(options: IdentifyOptions | None) -> bool:
 def _scale_of(
     name: str,
     case: _Case,
+    model: RobotModel,
     found: IdentifiedInstruments,
     log: JointLog,
     options: IdentifyOptions | None,
@@ -145,7 +148,7 @@ def _scale_of(
     known = any(t.instrument == name and t.finding.cause.stage == "wire" for t in reported)
     if known or options is None or not _lengths_are_believed(options):
         return None
-    finding = scale_by_lengths(found, name, case.recording, log, options)
+    finding = scale_by_lengths(model, found, name, case.recording, log, options)
     return None if finding is None else ReportedCause(finding, name, by_priors=True)
 
 

@@ -19,6 +19,7 @@ from robcal.calibration.joint_log import JointLog
 from robcal.diagnosis.gain.delivered import Gain, blocks_of, gain_of
 from robcal.estimation.minimum_norm import solve
 from robcal.recipe.in_force import FEW, Form, Groups, InForce, contradicted, groups_of, with_terms
+from robcal.robot.model import RobotModel
 from robcal.transforms import Array
 
 
@@ -80,19 +81,23 @@ class JointDelivery:
 
 @dataclass(frozen=True)
 class InstrumentFolds:
-    """Forms of a robot compared at all instruments, each a part of ``found``, which has everything that was told."""
+    """Forms of a robot compared at all instruments, each a part of ``found``, which has everything that was told.
 
+    ``model`` : the robot with its terms that ``found`` was identified from.
+    """
+
+    model: RobotModel = field(repr=False)
     found: IdentifiedInstruments = field(repr=False)
     log: JointLog = field(repr=False)
     options: IdentifyOptions
 
     @cached_property
     def _fitted(self) -> LinearInstruments:
-        return linearised(self.found, self.log, self.options)
+        return linearised(self.model, self.found, self.log, self.options)
 
     @cached_property
     def _stated(self) -> LinearInstruments:
-        return linearised(self.found, self.log.as_stated(), self.options)
+        return linearised(self.model, self.found, self.log.as_stated(), self.options)
 
     @cached_property
     def of_rows(self) -> Array:

@@ -7,16 +7,17 @@ import numpy as np
 
 from robcal.calibration.calibrated import CalibratedRobot
 from robcal.calibration.joint_log import JointLog
-from robcal.calibration.measurements import frame_observations
 from robcal.calibration.observations import FrameObservations
 from robcal.calibration.verification import fit_nominal
 from robcal.joint_adjustment.adjustment import adjust_jointly
 from robcal.joint_adjustment.result import JointAdjustment
-from robcal.photogrammetry.measure.frames import measure_frames
+from robcal.photogrammetry.measure.frames import MeasuredFrames, frame_sensitivities, measure_frames
+from robcal.photogrammetry.measure.measured_points import MeasuredPoints
 from robcal.photogrammetry.measure.points import measure_points
 from robcal.photogrammetry.station.network import StationMarks, StationOrientation
 from robcal.recipe.identification import Identification
 from robcal.robot.model import RobotModel
+from robcal.transforms import Array, transport_covariance
 
 
 @dataclass(frozen=True)
@@ -62,11 +63,22 @@ def adjust_robot(
     points = measure_points(found.orientation, marks)
     frames = measure_frames(points, found.orientation.body, tolerance=tolerance)
     detailed = FrameObservations(frames.pose, frames.world_T_body, frames.covariance)
-    recording = replace(
-        identification.recording, observations=(frame_observations(points, frames),), detailed=(detailed,)
-    )
+    observed = replace(detailed, covariance=frames.covariance + _beside_the_robot(found, log, points, frames))
+    recording = replace(identification.recording, observations=(observed,), detailed=(detailed,))
     used = ~np.isin(identification.rows, found.loose)
     anew = replace(identification, robot=replace(identification.robot, used=used), recording=recording)
     inputs = log.inputs(found.robot.kernel)
     nominal = fit_nominal(model, inputs.subset(anew.sound), recording.select(anew.sound))
     return JointlyAdjusted(found.robot.with_recording(log, nominal.model), found, anew)
+
+
+def _beside_the_robot(found: JointAdjustment, log: JointLog, points: MeasuredPoints, frames: MeasuredFrames) -> Array:
+    """(n, 6, 6) what the errors of cameras and body add to frames beyond what the robot, adjusted with them, follows.
+
+    A frame misses the robot's prediction by ``K c - J t`` with the errors c and t of station and robot, whose joint
+    covariance is known: this less the part ``J Q J'`` of the robot alone, which a verification adds itself.
+    """
+    kernel, columns = found.robot.kernel, found.robot.columns
+    J = kernel.frames_and_jacobian(kernel.theta0, log.inputs(kernel).subset(frames.pose), columns)[1]
+    by_all = np.concatenate([*frame_sensitivities(points, frames), -J], axis=2)
+    return transport_covariance(by_all, found.covariance) - transport_covariance(J, found.relative)

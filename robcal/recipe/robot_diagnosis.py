@@ -236,6 +236,16 @@ def robot_in_force(
     return robot, relative, put, final
 
 
+def undiagnosed(found: Identification, log: JointLog, measured: Measured) -> CalibratedRobot:
+    """The identified robot where nothing is diagnosed, with what kept-out folds show beyond its parameters."""
+    robot, recording = found.robot, measured.recording(log, found.recording, found.rows)
+    if recording is None or recording.own_station:
+        return robot
+    recording, form = recording.subset(robot.used), Form(robot.model, robot.names)
+    least = estimate_noise(form.model, recording, form.free).factor
+    return with_lack_of_fit(robot, found, log, recording, found.rows[robot.used], form, least)
+
+
 def with_lack_of_fit(
     robot: CalibratedRobot,
     found: Identification,

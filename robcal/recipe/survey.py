@@ -42,8 +42,8 @@ def size_of_marks(table: MarksTable) -> tuple[int, int]:
 
 def hardly_seen(targets: Iterable[int], images: Mapping[int, int], own: Sequence[int]) -> frozenset[int]:
     """Those of some targets that far fewer images (number by id) show than the body's own targets."""
-    usual = float(np.median([images.get(target, 0) for target in own])) if own else 0.0
-    return frozenset(target for target in targets if images.get(target, 0) <= _MISREAD * usual)
+    typical = float(np.median([images.get(target, 0) for target in own])) if own else 0.0
+    return frozenset(target for target in targets if images.get(target, 0) <= _MISREAD * typical)
 
 
 def surveyed_body(name: str, file: BodyFile, done: SurveyResult, absent: frozenset[int] = frozenset()) -> Body:

@@ -222,27 +222,33 @@ def without_blunders(
     names: Sequence[str],
 ) -> tuple[Rows, list[str]]:
     """Kept-out poses without those that contradict even the nominal robot, which has seen none of them."""
-    usual = max(tool_miss(nominal, inputs, recording, rows).values(), default=0.0)
-    limit = max(BLUNDER * usual, usual + LEAST_BLUNDER)
-    found = {pose: miss for pose, miss in tool_miss(nominal, inputs, recording, kept_out).items() if miss > limit}
+    typical = max(tool_residual(nominal, inputs, recording, rows).values(), default=0.0)
+    limit = max(BLUNDER * typical, typical + LEAST_BLUNDER)
+    found = {
+        pose: residual
+        for pose, residual in tool_residual(nominal, inputs, recording, kept_out).items()
+        if residual > limit
+    }
     if not found or len(found) > len(kept_out) / 2:
         return kept_out, []
     notes = [
-        f"kept-out pose '{names[pose]}' was left out: measured {1e3 * miss:.3g} mm from where even the nominal robot "
-        f"is ({1e3 * usual:.2g} mm at most elsewhere), which is no error of a robot"
-        for pose, miss in found.items()
+        f"kept-out pose '{names[pose]}' was left out: measured {1e3 * residual:.3g} mm from where even the nominal "
+        f"robot is ({1e3 * typical:.2g} mm at most elsewhere), which is no error of a robot"
+        for pose, residual in found.items()
     ]
     return kept_out[~np.isin(kept_out, list(found))], notes
 
 
-def tool_miss(robot: IdentifiedRobot, inputs: PoseInputs, recording: RobotRecording, rows: Rows) -> dict[int, float]:
+def tool_residual(
+    robot: IdentifiedRobot, inputs: PoseInputs, recording: RobotRecording, rows: Rows
+) -> dict[int, float]:
     """Largest miss (m) of what was measured, by row of the pose."""
     observations = recording.select(rows)
     T, _ = robot.predict(inputs.subset(rows))
     out: dict[int, float] = {}
-    for pose, miss in zip(*tool_errors(T, observations)["0"], strict=True):
+    for pose, residual in zip(*tool_errors(T, observations)["0"], strict=True):
         row = int(rows[pose])
-        out[row] = max(out.get(row, 0.0), float(miss))
+        out[row] = max(out.get(row, 0.0), float(residual))
     return out
 
 

@@ -23,6 +23,7 @@ from robcal.estimation.minimum_norm import solve
 from robcal.physics.cause import DEVIATION, numeric_sigma
 from robcal.physics.measuring import WIRE_SCALE, measuring_causes
 from robcal.robot.kernel_cache import kernel_of
+from robcal.robot.model import RobotModel
 
 USUAL_LENGTH = 2e-4
 """m; deviation of a link that is usual. Less than that is no reason for an alarm."""
@@ -41,11 +42,14 @@ WORDS: Mapping[str, str] = {
 }
 
 
-def wire_alarms(found: IdentifiedInstruments, log: JointLog, options: IdentifyOptions | None = None) -> list[str]:
+def wire_alarms(
+    model: RobotModel, found: IdentifiedInstruments, log: JointLog, options: IdentifyOptions | None = None
+) -> list[str]:
     """A sentence where links are off in a way that wires explain, or that nothing does; empty where all is usual.
 
     Parameters
     ----------
+    model : the robot that was identified from.
     options : as for the identification; its priors are what is believed of single parameters.
     """
     identified = [p for p in found.placed.values() if p.robot is not None and not p.instrument.loop]
@@ -55,9 +59,10 @@ def wire_alarms(found: IdentifiedInstruments, log: JointLog, options: IdentifyOp
     options = options or IdentifyOptions()
     links = _links(robot)
     # without a stated prior a link may be off by anything: robots of old drawings are
+    off = {n: robot.values[n] - model.parameters.get(n, 0.0) for n in links}
     stated = {n: options.priors[n] for n in links if n in options.priors}
-    far = [n for n in stated if abs(robot.values[n]) - USUAL_LENGTH > SURE * np.hypot(_sigma(robot, n), stated[n])]
-    named = [f"{n} {1e3 * robot.values[n]:+.2f} +- {1e3 * _sigma(robot, n):.2g} mm" for n in far]
+    far = [n for n in stated if abs(off[n]) - USUAL_LENGTH > SURE * np.hypot(_sigma(robot, n), stated[n])]
+    named = [f"{n} {1e3 * off[n]:+.2f} +- {1e3 * _sigma(robot, n):.2g} mm" for n in far]
     reason = f"links are off by more than links may be ({', '.join(named)}), which a fault of the wire does"
     best = 0.0
     for placed in identified:
@@ -65,14 +70,13 @@ def wire_alarms(found: IdentifiedInstruments, log: JointLog, options: IdentifyOp
             if kind in placed.instrument.wire:
                 continue
             name = f"{placed.instrument.name}.wire.{kind}"
-            linear = linearised(found, log, options, {placed.instrument.name: (kind,)})
+            linear = linearised(model, found, log, options, {placed.instrument.name: (kind,)})
             value, sigma, moved = explained(linear, name, robot, options)
             strength = abs(value) / (sigma * max(robot.sigma0, 1.0))
             if strength > max(SURE, best) and moved:
                 best = strength
                 reason = f"a wire that {WORDS[kind]} explains it better than links that are off: " + ", ".join(
-                    f"{n} {1e3 * robot.values[n]:+.2f} mm would be {1e3 * (robot.values[n] + v):+.2f} mm"
-                    for n, v in moved.items()
+                    f"{n} {1e3 * off[n]:+.2f} mm would be {1e3 * (off[n] + v):+.2f} mm" for n, v in moved.items()
                 )
     if not far and best == 0.0:
         return []
@@ -80,18 +84,24 @@ def wire_alarms(found: IdentifiedInstruments, log: JointLog, options: IdentifyOp
 
 
 def scale_by_lengths(
-    found: IdentifiedInstruments, name: str, recording: Recording, log: JointLog, options: IdentifyOptions
+    model: RobotModel,
+    found: IdentifiedInstruments,
+    name: str,
+    recording: Recording,
+    log: JointLog,
+    options: IdentifyOptions,
 ) -> Finding | None:
     """A wrong scale of a wire, told by what is believed of the lengths of links; None where it is not certain.
 
     Parameters
     ----------
-    name : of the instrument. recording : its measurements as the diagnosis takes them.
+    model : the robot that was identified from. name : of the instrument.
+    recording : its measurements as the diagnosis takes them.
     """
     robot = found.placed[name].robot
     if robot is None:
         return None
-    linear = linearised(found, log, options, {name: ("scale",)})
+    linear = linearised(model, found, log, options, {name: ("scale",)})
     value, sigma, _ = explained(linear, f"{name}.wire.scale", robot, options)
     sigma *= max(robot.sigma0, 1.0)
     if abs(value) < CERTAIN * sigma:

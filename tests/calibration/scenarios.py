@@ -67,6 +67,6 @@ def scenario(
     return Scenario(model, kernel, kernel.with_references(W, F), theta, inside, outside, rng)
 
 
-def tool_miss(T: np.ndarray, truth: np.ndarray) -> float:
+def tool_residual(T: np.ndarray, truth: np.ndarray) -> float:
     """Mean distance of tool origins, m."""
     return float(np.linalg.norm((T - truth)[:, :3, 3], axis=1).mean())

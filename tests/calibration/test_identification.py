@@ -14,7 +14,7 @@ from robcal.calibration.observations import (
 from robcal.errors import InvalidInput, NotIdentifiable
 from robcal.robot.kernel import Kernel
 from robcal.robot.model import Term
-from tests.calibration.scenarios import Scenario, scenario, tool_miss
+from tests.calibration.scenarios import Scenario, scenario, tool_residual
 from tests.robot.chains import kr_like
 
 
@@ -33,7 +33,7 @@ def test_exact_data_are_reproduced_to_rounding() -> None:
     robot = identify(s.model, s.poses, [exact], kernel=s.kernel)
     assert robot.summary.converged
     # parameters left at nominal (parallel axes) cost less than a tenth of the stated noise
-    assert tool_miss(robot.predict(s.kept_out)[0], s.truth.frames(s.theta, s.kept_out)) < 5e-6
+    assert tool_residual(robot.predict(s.kept_out)[0], s.truth.frames(s.theta, s.kept_out)) < 5e-6
 
 
 @pytest.mark.parametrize("compliant", [False, True])
@@ -46,7 +46,7 @@ def test_as_good_as_an_oracle_that_knows_the_form(compliant: bool) -> None:
         form = [n for n in s.kernel.names if s.theta[s.kernel.index[n]] != 0]
         for options, out in ((IdentifyOptions(), ours), (IdentifyOptions(parameters=form), oracle)):
             robot = identify(s.model, s.poses, [observed], options, s.kernel)
-            out.append(tool_miss(robot.predict(s.kept_out)[0], truth))
+            out.append(tool_residual(robot.predict(s.kept_out)[0], truth))
             assert robot.summary.converged
     assert np.mean(ours) < 1.08 * np.mean(oracle)
     assert np.mean(ours) < 3.5e-5
@@ -111,7 +111,7 @@ def test_mixtures_of_frames_points_distances_and_sensor() -> None:
     )
     robot = identify(s.model, s.poses, parts, kernel=s.kernel)
     assert 0.85 < robot.sigma0 < 1.15
-    assert tool_miss(robot.predict(s.kept_out)[0], s.truth.frames(s.theta, s.kept_out)) < 8e-5
+    assert tool_residual(robot.predict(s.kept_out)[0], s.truth.frames(s.theta, s.kept_out)) < 8e-5
 
 
 def test_distances_alone() -> None:
@@ -156,7 +156,7 @@ def test_basis_norm_table_5_4_and_named_parameters() -> None:
         IdentifyOptions(statics="converged"),
     ):
         robot = identify(s.model, s.poses, [observed], options)
-        assert tool_miss(robot.predict(s.kept_out)[0], truth) < 5e-4, options
+        assert tool_residual(robot.predict(s.kept_out)[0], truth) < 5e-4, options
     robot = identify(s.model, s.poses, [observed], IdentifyOptions(parameters=["axis2.pitch"]), s.kernel)
     assert set(robot.names) - {"axis2.pitch"} == {
         f"{e}.{k}" for e in ("base", "tool") for k in ("x", "y", "z", "roll", "pitch", "yaw")

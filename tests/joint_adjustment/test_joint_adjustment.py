@@ -140,14 +140,14 @@ def _pixels(lin) -> np.ndarray:  # type: ignore[no-untyped-def]
     return np.linalg.solve(lin.whitening, lin.residual[..., None])[..., 0]
 
 
-def _miss(robot: CalibratedRobot, truth: OwnTruth) -> tuple[np.ndarray, np.ndarray]:
+def _exchange_residual(robot: CalibratedRobot, truth: OwnTruth) -> tuple[np.ndarray, np.ndarray]:
     """Errors (n, 3) of the tool's place at the kept-out poses, and their stated covariance."""
     T, C = robot.predict(robot.kernel.poses(truth.kept_out.q, truth.kept_out.circumstances.payload))
     return difference(T, kept_out_frames(truth))[:, :3], C[:, :3, :3]
 
 
 def _distance(robot: CalibratedRobot, truth: OwnTruth) -> float:
-    return float(np.linalg.norm(_miss(robot, truth)[0], axis=1).mean())
+    return float(np.linalg.norm(_exchange_residual(robot, truth)[0], axis=1).mean())
 
 
 def test_robot_and_cameras_stiffen_each_other(campaign: Campaign, found: JointAdjustment) -> None:
@@ -167,7 +167,7 @@ def test_robot_and_cameras_stiffen_each_other(campaign: Campaign, found: JointAd
 def test_covariance_holds_in_the_world_of_the_cameras(campaign: Campaign, found: JointAdjustment) -> None:
     square = [
         float(np.mean(np.einsum("ni,nij,nj->n", d, np.linalg.inv(C), d))) / 3.0
-        for d, C in (_miss(robot, campaign.truth) for robot in (campaign.staged, found.robot))
+        for d, C in (_exchange_residual(robot, campaign.truth) for robot in (campaign.staged, found.robot))
     ]
     assert square[0] > 10.0  # what all frames share is not in the covariance of a robot from frames
     assert square[1] < 2.5

@@ -35,12 +35,15 @@ def edit_yaml(path: Path, change: Callable[[dict], None]) -> None:
     path.write_text(yaml.safe_dump(data, sort_keys=False), encoding="utf-8")
 
 
-@pytest.fixture(scope="session")
-def point_campaign_source(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("points") / "campaign"
-    make_campaign(folder, seed=5, level="points", poses=40, verify=8)
+def _undiagnosed(folder: Path, seed: int, level: str) -> Path:
+    make_campaign(folder, seed=seed, level=level, poses=40, verify=8)
     edit_yaml(folder / "campaign.yaml", lambda d: d.update(diagnosis={"enabled": False}))
     return folder
+
+
+@pytest.fixture(scope="session")
+def point_campaign_source(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return _undiagnosed(tmp_path_factory.mktemp("points") / "campaign", 5, "points")
 
 
 @pytest.fixture
@@ -51,10 +54,7 @@ def point_campaign(point_campaign_source: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture(scope="session")
 def frame_campaign_source(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("frames") / "campaign"
-    make_campaign(folder, seed=6, level="frames", poses=40, verify=8)
-    edit_yaml(folder / "campaign.yaml", lambda d: d.update(diagnosis={"enabled": False}))
-    return folder
+    return _undiagnosed(tmp_path_factory.mktemp("frames") / "campaign", 6, "frames")
 
 
 @pytest.fixture

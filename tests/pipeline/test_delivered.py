@@ -74,3 +74,27 @@ def test_results_that_contradict_one_another_are_told(tmp_path: Path) -> None:
     assert freed.unstated is not None
     assert freed.delivered.coverage_95 == freed.unstated.coverage_95 != freed.recorded.coverage_95
     assert freed.delivered.normalised == pytest.approx(freed.unstated.normalised)
+
+
+def test_predictions_without_diagnosis_state_what_the_model_misses(tmp_path: Path) -> None:
+    campaign, run = tmp_path / "campaign", tmp_path / "run"
+    make_campaign(campaign, seed=7, level="points", poses=60, verify=30, effects=("backlash",), snr=150)
+    with (campaign / "campaign.yaml").open("a", encoding="utf-8") as file:
+        file.write("\ndiagnosis: {enabled: false}\n")
+    run_campaign(campaign, run, until="verify")
+    bare = replace(open_run(run).load(IDENTIFICATION).robot, joint_sigma=0.0)
+    assert np.all(np.asarray(load_calibrated(open_run(run)).joint_sigma) > 0.0)
+    predict_run(run, campaign / "poses.csv", tmp_path / "predicted.csv")
+    at, seen = read_table(tmp_path / "predicted.csv"), read_table(run / "frames.csv")
+    place = {pose: k for k, pose in enumerate(at.texts("pose"))}
+    log = read_table(campaign / "poses.csv")
+    kept_out = {p for p, s in zip(log.texts("pose"), log.texts("set"), strict=True) if s == "verify"}
+    rows = [k for k, pose in enumerate(seen.texts("pose")) if pose in kept_out]
+    there = [place[seen.texts("pose")[k]] for k in rows]
+    poses = read_campaign(campaign).poses
+    assert poses is not None
+    alone = 1e3 * np.sqrt(np.diagonal(bare.predict(bare.inputs(poses.as_stated()))[1], axis1=1, axis2=2)[:, :3])
+    error = np.stack([seen.numbers(f"{n}_mm")[rows] - at.numbers(f"{n}_mm")[there] for n in "xyz"], axis=1)
+    stated = np.stack([at.numbers(f"s{n}_mm")[there] for n in "xyz"], axis=1)
+    assert np.all(stated > alone[there])
+    assert np.mean(np.abs(error) < 1.96 * stated) > 0.85

@@ -34,7 +34,7 @@ def placed(T: np.ndarray) -> dict:  # type: ignore[type-arg]
     return {"xyz_mm": (1e3 * six[:3]).tolist(), "rpy_deg": np.degrees(six[3:]).tolist()}
 
 
-def looked(folder: Path) -> tuple[np.ndarray, np.ndarray, list[int], np.ndarray]:
+def examined(folder: Path) -> tuple[np.ndarray, np.ndarray, list[int], np.ndarray]:
     """True sensor frames, targets and their ids at the poses of a folder; angles of the tilt in degrees."""
     table = read_table(folder / "poses.csv")
     q = np.radians(np.column_stack([table.numbers(f"q{k}_deg") for k in range(1, 7)]))
@@ -47,7 +47,7 @@ def looked(folder: Path) -> tuple[np.ndarray, np.ndarray, list[int], np.ndarray]
 
 def measure(folder: Path, tool: dict) -> Path:  # type: ignore[type-arg]
     """A campaign from the poses of a folder: what the sensor reads there."""
-    T, p, ids, _ = looked(folder)
+    T, p, ids, _ = examined(folder)
     normal = p / np.linalg.norm(p, axis=1, keepdims=True)
     x, seen = SENSOR.read(T, p, normal, np.random.default_rng(len(folder.name)))
     names = [f"p{k:03d}" for k in range(1, len(x) + 1)]
@@ -105,7 +105,7 @@ def test_nine_unknowns_are_calibrated_and_the_orientation_is_held(first_round: P
 
 
 def test_aimed_again_the_sensor_stands_square(first_round: Path) -> None:
-    assert looked(first_round / "one")[3].max() > 2.0
+    assert examined(first_round / "one")[3].max() > 2.0
     (first_round / "two").mkdir()
     config = {
         "format": "robcal/poses-1",
@@ -116,7 +116,7 @@ def test_aimed_again_the_sensor_stands_square(first_round: Path) -> None:
     }
     write_yaml(first_round / "two.yaml", config)
     generate_poses(first_round / "two.yaml", first_round / "two" / "poses.csv")
-    T, p, _, tilt = looked(first_round / "two")
+    T, p, _, tilt = examined(first_round / "two")
     assert tilt.max() < 0.1
     assert np.linalg.norm(T[:, :3, 3] + 0.2 * T[:, :3, 2] - p, axis=1).max() < 3e-4
 

@@ -149,9 +149,9 @@ class JointEvaluator(Evaluator):
         return State(theta, *moved)
 
     def deviations(self, state: State) -> Array:
-        """How far each parameter is from where priors expect it: worlds and tools from what is given of them."""
-        out = state.theta.copy()
-        out[self._wires] -= self.theta0[self._wires]
+        """How far each parameter is from where priors expect it: what the files of robot and wires say, and what is
+        given of worlds and tools."""
+        out = state.theta - self.theta0
         for end, T in zip(self.cell, (*state.world_T_base, *state.flange_T_tool), strict=True):
             out[self.columns_of(end)] = end.deviation(T)
         return out

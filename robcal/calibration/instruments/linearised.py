@@ -12,6 +12,7 @@ from robcal.calibration.joint_log import JointLog
 from robcal.calibration.measurements import Rows
 from robcal.calibration.problem import Problem, State, whitening
 from robcal.robot.kernel import Kernel
+from robcal.robot.model import RobotModel
 from robcal.transforms import Array
 
 
@@ -21,7 +22,7 @@ class LinearInstruments:
 
     Attributes
     ----------
-    names, values : (p,) parameters and their values (SI); of worlds and tools how far they are from what is given.
+    names, values : (p,) parameters and how far they are from what is given (SI); of wires from nothing.
     residual, jacobian : (n, D) and (n, D, p), whitened, by stop of the robot and instrument; zero where padded.
     plain, plain_jacobian : the same in the units of the measurements (m, rad).
     spatial : (n, D) which of these are positions or lengths. pose : (n,) rows of the joint log.
@@ -41,6 +42,7 @@ class LinearInstruments:
 
 
 def linearised(
+    model: RobotModel,
     found: IdentifiedInstruments,
     log: JointLog,
     options: IdentifyOptions,
@@ -50,6 +52,7 @@ def linearised(
 
     Parameters
     ----------
+    model : the robot that ``found`` was identified from.
     wires : by instrument, parameters of its wire to be free beside those that were identified.
     """
     taking_part = [p for p in found.placed.values() if p.robot is not None]
@@ -70,6 +73,9 @@ def linearised(
         np.array([at[w.name] for w in evaluator.worlds]),
         np.array([tool[t.name] for t in evaluator.tools]),
     )
+    before = Kernel(replace(model, world_T_base=None, flange_T_tool=None), options.statics)
+    start = dict(zip(before.names, before.theta0, strict=True))
+    evaluator.theta0[: len(kernel.names)] = [start.get(n, 0.0) for n in kernel.names]
     added = [f"{name}.wire.{kind}" for name, kinds in wires.items() for kind in kinds]
     names = tuple(dict.fromkeys((*found.names, *added)))
     columns = [evaluator.index[n] for n in names]

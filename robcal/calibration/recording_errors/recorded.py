@@ -137,7 +137,7 @@ def as_frames(observations: Sequence[Observations]) -> tuple[Observations, ...]:
     return tuple(out)
 
 
-def pose_misses(recorded: Recorded) -> Array:
+def pose_residuals(recorded: Recorded) -> Array:
     """RMS residual (n,) of the nominal robot at each pose with the best base and tool, m; NaN where unmeasured.
 
     Raises
@@ -195,7 +195,7 @@ def trimmed(residuals: Array, share: float = CLOSEST) -> float:
 def residual_rms(recorded: Recorded, robust: bool = True) -> float:
     """RMS residual (m) of the nominal robot with the best base and tool; infinite where none can be fitted."""
     try:
-        return trimmed(pose_misses(recorded), CLOSEST if robust else 1.0)
+        return trimmed(pose_residuals(recorded), CLOSEST if robust else 1.0)
     except RobcalError:
         return np.inf
 

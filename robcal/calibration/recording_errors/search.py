@@ -196,11 +196,11 @@ def check_failed_fit(
     if fault:
         raise InvalidInput(f"{_log_words(robot)} and measurements do not belong together: {fault}")
     T = found.kernel.frames(found.kernel.theta0, inputs)
-    miss = float(np.sqrt(np.mean(np.concatenate([o.evaluate(T)[0].ravel() ** 2 for o in recording.observations]))))
+    residual = float(np.sqrt(np.mean(np.concatenate([o.evaluate(T)[0].ravel() ** 2 for o in recording.observations]))))
     size = float(np.linalg.norm(np.std(T[:, :3, 3], axis=0)))
-    if miss > max(HOPELESS, HOPELESS_SHARE * size):
+    if residual > max(HOPELESS, HOPELESS_SHARE * size):
         raise InvalidInput(
-            f"even the identified robot misses the measurements by {1e3 * miss:.3g} mm RMS: joint "
+            f"even the identified robot misses the measurements by {1e3 * residual:.3g} mm RMS: joint "
             "angles, robot file and measurements do not belong together, and no single fault (sign, unit, exchanged "
             "columns, shifted rows) explains it: check which recording belongs to which"
         )

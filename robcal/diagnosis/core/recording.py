@@ -79,7 +79,7 @@ class Recording:
         L = np.linalg.cholesky(self.observations.noise(frames))
         return np.asarray(L @ plain.reshape(len(L), -1, rows.shape[1]))
 
-    def beside_common(self, rows: Array) -> Array:
+    def given_common(self, rows: Array) -> Array:
         """Rows (m, ...) that are whitened pose by pose, beside the errors common to all poses."""
         return rows if self._common is None else self._common.whiten(rows)
 

@@ -148,7 +148,7 @@ class Gain:
         """The error falls, in the folds by clearly more than their standard error, and in none it grows much."""
         return self.after < self.before and self.strength > PAYING_SIGMAS and self.even
 
-    def pays_beside(self, weighted: "Gain") -> bool:
+    def pays_jointly(self, weighted: "Gain") -> bool:
         """The error falls, or that weighted by its uncertainty does beyond doubt while this one stays as it is.
 
         Directions and places that are measured best show small effects which the plain length hides in noise.

@@ -39,17 +39,22 @@ def exchanged_targets(
     suspects = [t for t in suspects if int(given.index([t])[0]) >= 0 and given.known[int(given.index([t])[0])]]
     if len(suspects) < 2:
         return ()
-    misses = np.array([[_miss(orientation, marks, given, a, b) for b in suspects] for a in suspects])
+    residuals = np.array([[_exchange_residual(orientation, marks, given, a, b) for b in suspects] for a in suspects])
     found, taken = [], set()
     for i, first in enumerate(suspects):
-        j = int(np.argmin(misses[i]))
-        mutual = int(np.argmin(misses[j])) == i and i != j
-        if not mutual or first in taken or misses[i, j] > NEAR * misses[i, i] or misses[j, i] > NEAR * misses[j, j]:
+        j = int(np.argmin(residuals[i]))
+        mutual = int(np.argmin(residuals[j])) == i and i != j
+        if (
+            not mutual
+            or first in taken
+            or residuals[i, j] > NEAR * residuals[i, i]
+            or residuals[j, i] > NEAR * residuals[j, j]
+        ):
             continue
         second = suspects[j]
         taken |= {first, second}
         count = rejected[first] + rejected[second]
-        off = np.sqrt(0.5 * (misses[i, i] ** 2 + misses[j, j] ** 2))
+        off = np.sqrt(0.5 * (residuals[i, i] ** 2 + residuals[j, j] ** 2))
         kept = len(orientation.marks)
         before = float(np.sqrt((kept * orientation.rms_px**2 + count * 0.5 * off**2) / (kept + count)))
         # sign test: all these marks lie nearer to the other target, which chance does in half of them
@@ -70,7 +75,7 @@ def exchanged_targets(
     return tuple(found)
 
 
-def _miss(
+def _exchange_residual(
     orientation: StationOrientation, marks: Mapping[str, StationMarks], given: Body, label: int, target: int
 ) -> float:
     """Median distance (px) of the marks labelled `label` from the image of `target`."""

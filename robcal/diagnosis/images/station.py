@@ -96,27 +96,12 @@ def station_data(
     columns = global_columns(marks, e, c)
     camera_T_world = invert(orientation.world_T_exterior)[marks.exterior]
     T = camera_T_world @ orientation.world_T_body[marks.pose]
-    lens = _lens_rows(orientation, start or {})
-    m, active = len(marks), design.active.astype(float)
     unwhite = np.linalg.inv(design.whitening)
-    by_target = unwhite @ design.by_point if given is not None else None
-    padding, factor = 0, 1.0
-    for _ in range(2):  # a body less accurate than stated gets the weight that it deserves
-        body = _body_rows(orientation, given, factor)
-        extra = [(sparse.csr_matrix(J * active), r) for J, r in (lens, body)]
-        operator = StationOperator(design, marks.pose, columns, sparse.vstack([J for J, _ in extra], format="csr"))
-        padding = operator.A.shape[0] - 2 * m
-        residual = operator.remove(np.concatenate([design.residual.ravel(), *(r for _, r in extra)]))
-        if given is None or factor > 1.0:
-            break
-        spread = _target_spread(orientation, operator, residual)
-        if spread < LEAST_INFLATION:
-            break
-        factor = spread
+    operator, residual = _projected(orientation, columns, given, start or {})
 
     def whiten(displacement: Array) -> Array:
-        rows = (design.whitening @ displacement).reshape(2 * m, -1)
-        return np.concatenate([rows, np.zeros((padding, rows.shape[1]))])
+        rows = (design.whitening @ displacement).reshape(2 * len(marks), -1)
+        return np.concatenate([rows, np.zeros((operator.A.shape[0] - len(rows), rows.shape[1]))])
 
     single = scan_moves(design, marks, c, len(orientation.poses), columns).single
     scatter = float(np.median(single[single > 0]) / stats.chi2.median(6)) if np.any(single > 0) else 1.0
@@ -139,7 +124,7 @@ def station_data(
         whiten=whiten,
         remove=operator.remove,
         by_exterior=unwhite @ design.by_exterior,
-        by_target=by_target,
+        by_target=None if given is None else unwhite @ design.by_point,
         p_body=carried.points[marks.target] - centre,
         body=carried.name,
         free=_free(orientation, start or {}),
@@ -153,6 +138,26 @@ def station_data(
         },
         inflation={CAMERA_MOVED.name: max(1.0, scatter)},
     )
+
+
+def _projected(
+    orientation: StationOrientation, columns: Array, given: Body | None, start: Mapping[str, Camera | None]
+) -> tuple[StationOperator, Array]:
+    """The operator with rows of the lens and the body, and the residuals that it leaves."""
+    design = orientation.design
+    lens = _lens_rows(orientation, start)
+    factor = 1.0
+    while True:
+        rows = (lens, _body_rows(orientation, given, factor))
+        extra = sparse.vstack([sparse.csr_matrix(J * design.active.astype(float)) for J, _ in rows], format="csr")
+        operator = StationOperator(design, orientation.marks.pose, columns, extra)
+        residual = operator.remove(np.concatenate([design.residual.ravel(), *(r for _, r in rows)]))
+        if given is None or factor > 1.0:
+            return operator, residual
+        # a body less accurate than stated gets the weight that it deserves
+        factor = _target_spread(orientation, operator, residual)
+        if factor < LEAST_INFLATION:
+            return operator, residual
 
 
 def given_points(orientation: StationOrientation, given: Body) -> Body:

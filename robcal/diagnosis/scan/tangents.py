@@ -66,7 +66,7 @@ class Tangents:
         for basis in cause.laws(constants):
             law = self.laws.value(basis, self.variables)
             out[:, names.index(basis.parameter)] += self.motion[basis.frame, basis.kind] * law[self.row_pose]
-        return self.recording.beside_common(out)
+        return self.recording.given_common(out)
 
 
 def tangents(fit: Fit, recording: Recording, laws: Laws | None = None) -> Tangents:

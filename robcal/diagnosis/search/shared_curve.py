@@ -90,7 +90,7 @@ def seats(
     for sense in (1, -1):
         for part in np.array_split(turns, 8):
             law = sense * np.interp((sense * q[:, None] + part) % (2.0 * np.pi), grid, height)
-            trial = at.recording.beside_common(motion[:, None] * law[at.row_pose])
+            trial = at.recording.given_common(motion[:, None] * law[at.row_pose])
             trial = trial - basis @ (basis.T @ trial)
             along = np.clip(left @ trial, 0.0, None)
             gains.append(along**2 / np.maximum(np.sum(trial**2, axis=0), 1e-300))

@@ -9,7 +9,7 @@ from robcal.diagnosis.core.fitting import Accepted, Fit
 from robcal.diagnosis.scan.tangents import Tangents
 from robcal.diagnosis.search.folded_normals import amplitudes, folded
 from robcal.diagnosis.search.shared_curve import maker, refined, seats
-from robcal.physics.angle_error_curve import Placed, beside_shared
+from robcal.physics.angle_error_curve import Placed, difference_from_shared
 from robcal.physics.cause import Array, RobotCause
 from robcal.physics.site import Joint
 
@@ -83,7 +83,7 @@ def with_shared(
     if not _clear(alone, found.deviance):
         return None
     members = {p.joint.where for p in found.placed}
-    causes = [beside_shared(f, found.size) if f.where in members else f for f in group.causes]
+    causes = [difference_from_shared(f, found.size) if f.where in members else f for f in group.causes]
     return accepted_with(group.present, [found.cause, *causes], found.columns), list(found.columns)
 
 

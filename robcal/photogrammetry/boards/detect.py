@@ -118,8 +118,8 @@ def _judged(
 ) -> NDArray[np.bool_]:
     """(n,) corners that are clean, of the right colours, and where the board has them."""
     contrast = 2.0 * np.abs(fits.amplitude)
-    usual = float(np.median(fits.misfit[fits.converged])) if fits.converged.any() else 0.0
-    clean = fits.converged & (fits.misfit < min(_MISFIT, max(_MISFIT_CLEAN, _MISFIT_USUAL * usual)))
+    typical = float(np.median(fits.misfit[fits.converged])) if fits.converged.any() else 0.0
+    clean = fits.converged & (fits.misfit < min(_MISFIT, max(_MISFIT_CLEAN, _MISFIT_USUAL * typical)))
     clean &= contrast > _CONTRAST * np.sqrt(noise.at(fits.level))
     clean &= np.linalg.norm(fits.xy - first, axis=1) < 3.0
     turn = (fits.angle - start[:, 2:4] + np.pi) % (2 * np.pi) - np.pi

@@ -75,8 +75,8 @@ def grow(
         off = np.linalg.norm(project(lens, transform(pose, points[targets])) - xy[dots], axis=1)
         now = Grown(dots, targets, pose, lens, off)
         steady = before is not None and np.array_equal(dots, before.dots) and np.array_equal(targets, before.targets)
-        usual = 1.4 * float(np.median(off))
-        smaller = max(min(3.0 * usual, 0.75 * gate if step < 5 else gate), last)
+        typical = 1.4 * float(np.median(off))
+        smaller = max(min(3.0 * typical, 0.75 * gate if step < 5 else gate), last)
         if steady and smaller >= 0.95 * gate:
             return now
         gate, before = smaller, now

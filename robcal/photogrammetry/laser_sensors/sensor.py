@@ -89,8 +89,8 @@ class LaserSensor:
         """Which of the readings (m, r) no point gives, or lie beyond those of the calibration by more than a tenth of
         their range (m,)."""
         low, high = self.ranges.T
-        slack = 0.1 * (high - low)
-        far = ((readings < low - slack) | (readings > high + slack)).any(axis=1)
+        tolerance = 0.1 * (high - low)
+        far = ((readings < low - tolerance) | (readings > high + tolerance)).any(axis=1)
         return np.asarray(far | ~np.isfinite(_inverse(self.kind, readings, self.numbers)).all(axis=1))
 
     def points(self, readings: Array) -> tuple[Array, Array, Array]:

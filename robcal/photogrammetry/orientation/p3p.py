@@ -116,7 +116,7 @@ def _polish(s: Array, cosines: Array, squares: Array) -> Array:
     order = np.array([[1, 2], [0, 2], [0, 1]])
     for step in range(3):
         one, two = s[..., order[:, 0]], s[..., order[:, 1]]
-        miss = one**2 + two**2 - 2 * one * two * cosines - squares
+        residual = one**2 + two**2 - 2 * one * two * cosines - squares
         if step == 2:
             break
         jacobian = np.zeros((*s.shape, 3))
@@ -127,7 +127,7 @@ def _polish(s: Array, cosines: Array, squares: Array) -> Array:
         flat = flat + 1e-12 * np.eye(3) * np.abs(flat).max(axis=(-2, -1), keepdims=True)
         singular = np.abs(np.linalg.det(flat)) < 1e-12 * np.abs(flat).max(axis=(-2, -1)) ** 3
         flat[singular] = np.eye(3)
-        update = np.linalg.solve(flat, miss[..., None])[..., 0]
+        update = np.linalg.solve(flat, residual[..., None])[..., 0]
         s = s - np.where(singular[..., None], 0.0, update)
-    wrong = np.abs(miss).max(axis=-1) > 1e-5 * squares.max(axis=-1)
+    wrong = np.abs(residual).max(axis=-1) > 1e-5 * squares.max(axis=-1)
     return np.where(wrong[..., None], np.nan, s)

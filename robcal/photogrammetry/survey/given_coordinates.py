@@ -40,10 +40,10 @@ class GivenCoordinates:
     @property
     def mirror_words(self) -> str:
         """The mirror image with its proof."""
-        usual, other = self.mirrored_mm or (np.nan, np.nan)
+        typical, other = self.mirrored_mm or (np.nan, np.nan)
         return (
-            f"survey and given coordinates are mirror images of each other (they differ by {usual:.3g} mm, mirrored by "
-            f"{other:.2g} mm)"
+            f"survey and given coordinates are mirror images of each other (they differ by {typical:.3g} mm, mirrored "
+            f"by {other:.2g} mm)"
         )
 
     def sentences(self, body: str) -> list[str]:
@@ -69,10 +69,10 @@ def compare_given(ids: IntArray, surveyed: Array, given: Array, sigma: Array) ->
     straight = _deviations(given[known], surveyed[known])
     mirror = _deviations(given[known], surveyed[known] * [1.0, 1.0, -1.0])
     noise = np.where(np.isfinite(sigma[known]), sigma[known], LEAST)
-    usual, other = float(np.median(straight)), float(np.median(mirror))
-    if other < MIRRORED * usual and usual > CONTRADICTS * float(np.median(noise)):
-        return GivenCoordinates(mirrored=(usual, other))
-    off = (straight > CONTRADICTS * noise) & (straight > CONTRADICTS * usual)
+    typical, other = float(np.median(straight)), float(np.median(mirror))
+    if other < MIRRORED * typical and typical > CONTRADICTS * float(np.median(noise)):
+        return GivenCoordinates(mirrored=(typical, other))
+    off = (straight > CONTRADICTS * noise) & (straight > CONTRADICTS * typical)
     rows: Sequence[int] = np.flatnonzero(off)[np.argsort(-straight[off])].tolist()
     names, stated = ids[known], sigma[known]
     return GivenCoordinates(tuple((int(names[i]), float(straight[i]), float(stated[i])) for i in rows))

@@ -146,3 +146,13 @@ def test_instruments_share_a_tool_on_request() -> None:
     found = identify_instruments(s.model, _log(s), both, GEOMETRY)
     assert np.array_equal(found.placed["wire"].flange_T_tool, found.placed["tracker"].flange_T_tool)
     assert found.placed["wire"].held == ("world_T_base.roll", "world_T_base.pitch", "world_T_base.yaw")
+
+
+def test_priors_are_about_what_the_file_of_the_robot_says() -> None:
+    s = scenario(6, n=30)
+    model = s.model.with_parameters({"axis3.x": 7e-4})
+    options = IdentifyOptions(("axis2.pitch", "axis3.x"), priors={"axis3.x": 1e-9}, robust=False)
+    frames = _frames(s, np.random.default_rng(0))
+    robot = identify_instruments(model, _log(s), [_instrument("a", frames)], options).placed["a"].robot
+    assert robot is not None
+    assert robot.values["axis3.x"] == pytest.approx(7e-4, abs=1e-6)

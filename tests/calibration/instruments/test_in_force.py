@@ -15,11 +15,13 @@ from robcal.robot.kernel import Kernel
 from robcal.robot.model import Term
 from tests.calibration.instruments.test_identification import _frames, _instrument, _lengths, _log
 from tests.calibration.scenarios import scenario
+from tests.robot.chains import kr_like
 
 OPTIONS = IdentifyOptions(("axis2.pitch", "axis3.pitch", "axis3.x", "axis5.pitch"), robust=False, covariance="stated")
 REAL = Term("wave", "axis2", "pitch", "a*sin(3*q2)", {"a": 0.0})
 IDLE = Term("idle", "axis3", "pitch", "b*cos(5*q4)", {"b": 0.0})
 BOTH = ("wave.a", "idle.b")
+MODEL = kr_like().with_terms((REAL, IDLE))
 
 
 @pytest.fixture(scope="module")
@@ -32,13 +34,12 @@ def watched() -> tuple[IdentifiedInstruments, JointLog, list]:
     rng = np.random.default_rng(5)
     log = _log(replace(s, model=s.model))
     instruments = [_instrument("tracker", _frames(s, rng)), _instrument("wire", _lengths(s, rng))]
-    model = s.model.with_terms((REAL, IDLE))
-    return identify_instruments(model, log, instruments, OPTIONS), log, instruments
+    return identify_instruments(MODEL, log, instruments, OPTIONS), log, instruments
 
 
 def test_a_term_that_is_there_pays_and_one_that_is_not_waits(watched) -> None:  # type: ignore[no-untyped-def]
     found, log, _ = watched
-    folds = InstrumentFolds(found, log, OPTIONS)
+    folds = InstrumentFolds(MODEL, found, log, OPTIONS)
     decided = choose_among(folds, BOTH)
     assert decided.diagnosed
     assert "wave.a" in decided.form.free
@@ -50,7 +51,7 @@ def test_a_term_that_is_there_pays_and_one_that_is_not_waits(watched) -> None:  
 
 def test_errors_over_folds_are_those_of_robots_identified_without_them(watched) -> None:  # type: ignore[no-untyped-def]
     found, log, instruments = watched
-    folds = InstrumentFolds(found, log, OPTIONS)
+    folds = InstrumentFolds(MODEL, found, log, OPTIONS)
     form = Form(found.placed["tracker"].robot.model, found.names)
     plain, _ = folds.delivery(form, log).errors(("wave.a",))
     fold = int(folds.labels[0])
