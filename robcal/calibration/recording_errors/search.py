@@ -19,7 +19,7 @@ from robcal.calibration.recording_errors.recorded import (
     RecordingFault,
     Trial,
     as_frames,
-    pose_misses,
+    pose_residuals,
     residual_rms,
     trimmed,
     workspace,
@@ -53,7 +53,7 @@ def _log_words(model: RobotModel) -> str:
 def find_faults(
     model: RobotModel, poses: PoseInputs, observations: Sequence[Observations], share: float = SUSPICIOUS_SHARE
 ) -> list[RecordingFault]:
-    """Faults that explain why the nominal robot misses the measurements by far; best explanation first.
+    """Faults that explain why the nominal robot residuals the measurements by far; best explanation first.
 
     ``share`` of the workspace that the nominal robot may miss before anything is suspected; zero looks in any case.
     Empty if the nominal robot fits as robots do, or if nothing known corrects the residual. Several: the data cannot
@@ -99,11 +99,11 @@ def _groups(
 
 def _proved_by_some(recorded: Recorded) -> list[RecordingFault]:
     """Faults of joints that move in few poses only, as where one joint moves after the other: most poses fit as is."""
-    misses = pose_misses(recorded)
-    if not trimmed(misses, 1.0) >= as_robots_do(recorded):
+    residuals = pose_residuals(recorded)
+    if not trimmed(residuals, 1.0) >= as_robots_do(recorded):
         return []
-    spread = np.linspace(0, len(misses) - 1, min(SCREENED, len(misses))).astype(np.int64)
-    worst = np.argsort(-np.nan_to_num(misses))[:SCREENED]
+    spread = np.linspace(0, len(residuals) - 1, min(SCREENED, len(residuals))).astype(np.int64)
+    worst = np.argsort(-np.nan_to_num(residuals))[:SCREENED]
     few = recorded.subset(np.unique(np.concatenate([spread, worst])))
     trials = (replace(trial, robust=False) for trial in chain(joint_trials(recorded, True), chain_trials(recorded)))
     return _proved(trials, recorded, few)
@@ -181,7 +181,7 @@ def check_joint_log(
 def check_failed_fit(
     robot: RobotModel, inputs: PoseInputs, recording: RobotRecording, kernel: Kernel, found: IdentifiedRobot
 ) -> None:
-    """Where even the identified robot misses by many sigmas, look for smaller faults (a sign of the last joint, say).
+    """Where even the identified robot residuals by many sigmas, look for smaller faults (a sign of the last joint, say).
 
     Raises
     ------
@@ -200,7 +200,7 @@ def check_failed_fit(
     size = float(np.linalg.norm(np.std(T[:, :3, 3], axis=0)))
     if residual > max(HOPELESS, HOPELESS_SHARE * size):
         raise InvalidInput(
-            f"even the identified robot misses the measurements by {1e3 * residual:.3g} mm RMS: joint "
+            f"even the identified robot residuals the measurements by {1e3 * residual:.3g} mm RMS: joint "
             "angles, robot file and measurements do not belong together, and no single fault (sign, unit, exchanged "
             "columns, shifted rows) explains it: check which recording belongs to which"
         )
