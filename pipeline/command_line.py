@@ -13,6 +13,7 @@ import typer
 from pipeline.json_io import plain
 from pipeline.messages import LOG, Heard, show
 from robcal.errors import InvalidInput, RobcalError
+from robcal.files.storage import in_plain_words
 
 Quiet = Annotated[bool, typer.Option("-q", "--quiet", help="Only warnings and errors on standard error.")]
 Json = Annotated[bool, typer.Option("--json", help="One result line for programs on standard output.")]
@@ -51,7 +52,7 @@ def answers(command: str, as_json: bool, quiet: bool) -> Iterator[dict[str, Any]
         _fail(command, as_json, *_sentences(error))
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
-        _fail(command, as_json, f"{where}{error.strerror or error}")
+        _fail(command, as_json, f"{where}{in_plain_words(error)}")
     except MemoryError:
         _fail(command, as_json, "not enough memory: use smaller images or fewer at once")
     except Exception as error:

@@ -45,6 +45,8 @@ def init(
         settings = DriftSettings(sigma=sigma_mm / 1000)
         answer.update(start(run_folder, readings, state, parameters=names, tool=tool, settings=settings))
         LOG.info(f"{state}: {answer['measurements']} measurements a tour, drifting: {', '.join(answer['parameters'])}")
+        for sentence in answer["unwatched"]:
+            LOG.warning(sentence)
 
 
 @app.command(short_help="Take readings in.")
@@ -147,5 +149,6 @@ def _stand(answer: dict[str, Any]) -> str:
     for name, value in answer["parameters"].items():
         unit, factor = ("mm", 1e3) if name.rsplit(".", 1)[-1] in "xyz" else ("deg", 57.29577951308232)
         lines.append(f"{name:>16}  {factor * value:+9.4f} +- {factor * answer['sigma'][name]:.4f} {unit}")
+    lines += answer["unwatched"]
     lines += [f"alarm at cycle {a['cycle']}: {a['kind']}: {a['text']}" for a in answer["alarms"][-10:]]
     return "\n".join(lines)

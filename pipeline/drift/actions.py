@@ -16,6 +16,7 @@ from pipeline.drift.readings_table import ReadingsTable, read_readings
 from pipeline.runs import campaign_of, open_run
 from pipeline.stages.identify import load_calibrated
 from robcal.drift.control import DriftControl, started
+from robcal.drift.jumps import unwatched_joints
 from robcal.drift.reference import DriftReference, DriftSettings, freeze
 from robcal.errors import InvalidInput
 from robcal.files.placement import PlacementEntry
@@ -69,6 +70,7 @@ def start(
         "measurements": len(reference.poses),
         "targets": len(set(reference.targets.tolist())),
         "cycle": state.newest_cycle,
+        "unwatched": unwatched_joints(reference),
     }
 
 
@@ -141,6 +143,7 @@ def status(place: Path | str) -> dict[str, Any]:
         "held": state.held,
         "missing": len(reference.poses) - opened,
         "noise": state.noise,
+        "unwatched": unwatched_joints(reference),
     }
 
 

@@ -10,7 +10,7 @@ from robcal.errors import RobcalError
 from robcal.files.storage import storage_error
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "microsoft-edge", "msedge")
-PATIENCE_S = 180
+PATIENCE_S = 600
 _DRAWING_MS = 60_000
 """Time of the page, which passes at once while nothing is drawn."""
 

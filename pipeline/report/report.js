@@ -2,7 +2,7 @@
 (function () {
   const root = document.documentElement;
   const printing = location.hash === "#print"; // `pipeline report --pdf` opens the page like this
-  const config = { displaylogo: false, responsive: !printing, staticPlot: printing, modeBarButtonsToRemove: ["lasso2d", "select2d"] };
+  const config = { displaylogo: false, responsive: !printing, modeBarButtonsToRemove: ["lasso2d", "select2d"] };
   const stored = (id) => JSON.parse(document.getElementById(id).textContent);
   const dark = matchMedia("(prefers-color-scheme: dark)");
   const night = stored("night"); // colours of plots on paper -> on a dark screen

@@ -21,7 +21,7 @@ from robcal.errors import InvalidInput, RobcalError, located
 from robcal.files.camera_file import CameraFile, write_camera
 from robcal.files.poses_table import Poses
 from robcal.imaging.detections import Detections
-from robcal.photogrammetry.core.adjustable import adjustable_names, plain
+from robcal.photogrammetry.core.adjustable import adjustable_names
 from robcal.photogrammetry.core.bodies import Body
 from robcal.photogrammetry.core.camera import INTRINSIC_NAMES, Camera
 from robcal.photogrammetry.station.identify import identify_station
@@ -163,7 +163,7 @@ def _write_cameras(campaign: Campaign, run: Run, orientation: StationOrientation
         sigma = np.sqrt(np.clip(np.diag(interior), 0, None))
         start = campaign.cameras[name].start
         content = CameraFile(
-            plain(camera),
+            camera,
             placed[name],
             start.pixel_um if start else None,
             {n: float(s) for n, s in zip(INTRINSIC_NAMES, sigma, strict=True) if n in adjustable_names(camera)},

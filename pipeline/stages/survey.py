@@ -16,7 +16,7 @@ from robcal.errors import InvalidInput, RobcalError, located
 from robcal.files.body_file import BodyFile, write_body
 from robcal.files.camera_file import CameraFile, write_camera
 from robcal.photogrammetry.bundle.colmap_engine import export_colmap
-from robcal.photogrammetry.core.adjustable import adjustable_names, plain
+from robcal.photogrammetry.core.adjustable import adjustable_names
 from robcal.photogrammetry.core.bodies import Body
 from robcal.photogrammetry.core.camera import INTRINSIC_NAMES, Camera
 from robcal.photogrammetry.core.network import Lengths
@@ -191,7 +191,7 @@ def _write(run: Run, name: str, source: BodySource, body: Body, done: SurveyResu
         export_colmap(done.network, run.colmap(name))
     sigmas = dict(zip(INTRINSIC_NAMES, map(float, sigma), strict=True))
     own = {n: sigmas[n] for n in adjustable_names(done.network.camera)}
-    camera = CameraFile(plain(done.network.camera), None, pixel, own)
+    camera = CameraFile(done.network.camera, None, pixel, own)
     path = run.camera(f"{NAME}_{name}")
     write_camera(path, camera, f"self-calibrated in the survey of {name}")
     return [run.body(name), path]

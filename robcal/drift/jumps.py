@@ -8,12 +8,18 @@ ratio of likelihoods (Kay 1998, Detection Theory, section 7.3), under the covari
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import linalg, special
+from scipy import linalg, special, stats
 
 from robcal import transforms as tf
 from robcal.drift.fit import Linearised
 from robcal.drift.reference import DriftReference, Ints
+from robcal.robot.kernel import PoseInputs
 from robcal.transforms import Array
+
+CRASH = float(np.radians(0.02))
+"""rad; turn of a joint after a crash that a control has to tell."""
+BETWEEN_TOURS = 600.0
+"""s; how old a model usually is when the next tour is complete."""
 
 
 @dataclass(frozen=True)
@@ -85,6 +91,40 @@ def find_jump(reference: DriftReference, slots: Ints, linear: Linearised, elapse
     if best is None or best.p_value >= reference.settings.level:
         return None
     return best if best.size > reference.settings.least_jump[0 if best.what == "body" else 1] else None
+
+
+def smallest_jumps(reference: DriftReference, elapsed: float = BETWEEN_TOURS) -> dict[str, float]:
+    """The smallest turn (rad, m) of each joint that a tour tells from drift and noise, by the name of its frame.
+
+    The size at which the sign of a jump reaches the level of an alarm on average, when the last model is ``elapsed``
+    seconds old. What a joint hardly moves for the sensor, or what drift does as well, is large; infinite where a tour
+    shows nothing of it. Weakness: readings are taken to be as certain as those of the reference.
+    """
+    kernel, m = reference.kernel, len(reference.q)
+    given = {name: np.full(m, value) for name, value in reference.robot.defaults.items()}
+    inputs = PoseInputs(reference.q, reference.load, {"index": np.zeros(m), **given})
+    T, J = kernel.frames_and_jacobian(kernel.theta0, inputs, reference.columns)
+    seen = tf.transform(tf.invert(T), reference.p)
+    A = (T[:, :3, :3] @ (J[:, :3] - tf.skew(seen) @ J[:, 3:])).reshape(3 * m, -1)
+    share = allowed_share(elapsed, reference.settings.time_constant)
+    S = A @ np.diag((share * reference.sizes) ** 2) @ A.T
+    S.reshape(m, 3, m, 3)[np.arange(m), :, np.arange(m)] += 2.0 * reference.covariance
+    columns = reference.joint_columns.reshape(3 * m, -1)
+    gain = np.sum(columns * linalg.cho_solve(linalg.cho_factor(S), columns), axis=0)
+    needed = float(stats.chi2.isf(reference.settings.level, 1))
+    sizes = np.sqrt(needed / np.maximum(gain, 1e-300))
+    return {f.name: float(size) for f, size in zip(kernel.model.joints, sizes, strict=True)}
+
+
+def unwatched_joints(reference: DriftReference) -> list[str]:
+    """A sentence for each turning joint of which a jump of 0.02 deg is not told by this reference's tour."""
+    smallest = {name: np.degrees(size) for name, size in smallest_jumps(reference).items() if size > CRASH}
+    return [
+        f"{f.name} cannot be watched by this tour: a jump has to be about {smallest[f.name]:.2g} deg to be told from "
+        "drift; look at targets farther from its axis"
+        for f in reference.kernel.model.joints
+        if f.name in smallest and not f.prismatic
+    ]
 
 
 def _hypotheses(reference: DriftReference, slots: Ints) -> dict[str, Array]:

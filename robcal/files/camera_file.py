@@ -14,6 +14,7 @@ from robcal.files.placement import Placement, placement_data
 from robcal.files.schemas import Entry, Number, Positive, read_entry, shown
 from robcal.files.storage import write_text
 from robcal.files.yaml_io import FlowMapping, yaml_text
+from robcal.photogrammetry.core.adjustable import plain
 from robcal.photogrammetry.core.camera import INTRINSIC_NAMES, Camera
 from robcal.photogrammetry.core.lenses import FISHEYE_NAMES, RATIONAL_NAMES, FisheyeCamera, RationalCamera
 from robcal.photogrammetry.core.splined import LEAST_NODES, SplinedCamera
@@ -183,8 +184,8 @@ def _check(camera: Camera, where: Mapping[str, str]) -> None:
 
 
 def write_camera(path: Path | str, content: CameraFile, comment: str = "") -> None:
-    """Write a camera file atomically."""
-    camera = content.camera
+    """Write a camera file atomically, with the lens that the camera has."""
+    camera = plain(content.camera)
     data: dict[str, Any] = {"format": FORMAT, "width": camera.width, "height": camera.height}
     data["model"] = next((m for kind, m in MODELS if isinstance(camera, kind)), "opencv")
     data.update({name: float(getattr(camera, name)) for name in camera.names})

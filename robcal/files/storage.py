@@ -17,6 +17,7 @@ class StorageError(RobcalError):
 
 _REMEDIES = {
     errno.ENOSPC: "the disk is full: free some space and run again, finished stages are kept",
+    errno.EFBIG: "the file grows beyond what this process may write (ulimit -f): raise the limit and run again",
     errno.EDQUOT: "the disk quota is used up: free some space and run again, finished stages are kept",
     errno.EACCES: "no permission: choose another folder with --out or change its rights",
     errno.EPERM: "no permission: choose another folder with --out or change its rights",
@@ -26,10 +27,14 @@ _REMEDIES = {
 }
 
 
+def in_plain_words(error: OSError) -> str:
+    """What the operating system says, with a remedy where there is one."""
+    return _REMEDIES.get(error.errno or 0, error.strerror or str(error))
+
+
 def storage_error(path: Path, error: OSError) -> StorageError:
     """The error to raise when the operating system refuses to write ``path``."""
-    remedy = _REMEDIES.get(error.errno or 0, error.strerror or str(error))
-    return StorageError(f"{path}: cannot be written: {remedy}")
+    return StorageError(f"{path}: cannot be written: {in_plain_words(error)}")
 
 
 def read_bytes(path: Path, limit: int) -> bytes:

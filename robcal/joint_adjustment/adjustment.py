@@ -29,9 +29,14 @@ CRITICAL = 4.0
 """Normalised residual from which on a mark is a gross error."""
 ROBUST_FACTOR = 2.0
 """The limit on squared residuals is this many times wider where gross errors still pull at the solution."""
+FEWEST_MARKS = 3
+"""Marks of a pose from which on they can outvote the robot."""
 ROUNDS, STEPS = 20, 30
 NEGLIGIBLE = 1e-3
 """Half the sum of squares (of whitened residuals) that is no reason for another step."""
+ROBUST_SIGMA = 1e-5
+"""Scatter of a joint (rad, m) that is the least as long as poses may have moved: without any, one that moved would be
+forced into its marks."""
 LEAST_SIGMA = 1e-9
 """Scatter of a joint (rad, m) that counts as none."""
 SETTLED = 0.02
@@ -79,7 +84,7 @@ def _settled(solution: Solution, *, robust: bool, rounds: int = 10) -> Solution:
     limits = solution.limits
     for _ in range(rounds):
         noise, scatter = _variance_factors(solution, solution.cofactors(), robust=robust)
-        problem, state = _rescaled(solution.problem, solution.here.state, noise, scatter)
+        problem, state = _rescaled(solution.problem, solution.here.state, noise, scatter, robust)
         start = problem.at(state, limits, solution.here)
         if max(np.abs(np.log(noise)).max(), abs(np.log(scatter))) < SETTLED:
             return _solve(problem, start, limits)
@@ -114,11 +119,11 @@ def _factor(square: Array, share: Array, count: int, median: float, robust: bool
 
 
 def _rescaled(
-    problem: JointProblem, state: JointState, noise: Array, scatter: float
+    problem: JointProblem, state: JointState, noise: Array, scatter: float, robust: bool
 ) -> tuple[JointProblem, JointState]:
     """With other variance components; frames stay where they are."""
     largest = float(problem.joint_sigma.max())
-    scatter = max(scatter, LEAST_SIGMA / largest)
+    scatter = max(scatter, (ROBUST_SIGMA if robust else LEAST_SIGMA) / largest)
     problem = replace(
         problem, noise=problem.noise * noise, joint_sigma=problem.joint_sigma * scatter, root=problem.root * scatter
     )
@@ -136,9 +141,10 @@ def _tested(
     for _ in range(ROUNDS):
         found = solution.cofactors()
         problem, state, limits = solution.problem, solution.here.state, solution.limits
-        out = _worst_marks(solution, found, limit if limits is None else ROBUST_FACTOR * limit)
-        moved = None if out.any() else _worst_pose(solution, found)  # single marks may make a pose look as if moved
-        if out.any():
+        out, moved = _worst_marks(solution, found, limit if limits is None else ROBUST_FACTOR * limit)
+        if moved is None and not out.any():  # single marks may make a pose look as if moved
+            moved = _worst_pose(solution, found)
+        if moved is None and out.any():
             table = problem.marks.select(out)
             ids = orientation.body.ids[table.target]
             why = "contradicts all other marks and the robot"
@@ -168,14 +174,19 @@ def _worst_pose(solution: Solution, found: Cofactors) -> int | None:
     return max(some, key=lambda i: float(square[i])) if some else None
 
 
-def _worst_marks(solution: Solution, found: Cofactors, limit: float) -> np.ndarray:
-    """(m,) the worst mark of each image, where it is beyond the limit."""
+def _worst_marks(solution: Solution, found: Cofactors, limit: float) -> tuple[np.ndarray, int | None]:
+    """(m,) the worst mark of each image, where it is beyond the limit; and the pose to which most such marks belong.
+
+    Where more than half of a pose's marks are beyond it, they are right and the pose is not where the robot takes it.
+    """
     marks = solution.problem.marks
     T2 = mark_statistic(solution.here.lin.residual, found.marks)
     image = marks.camera * (int(marks.pose.max()) + 1) + marks.pose
     worst = np.zeros(int(image.max()) + 1)
     np.maximum.at(worst, image, T2)
-    return (limit < T2) & (worst[image] == T2)
+    count, bad = np.bincount(marks.pose), np.bincount(marks.pose, weights=limit < T2)
+    moved = solution.problem.tied & (count >= FEWEST_MARKS) & (bad > 0.5 * count)
+    return (limit < T2) & (worst[image] == T2), int(np.argmax(bad * moved)) if moved.any() else None
 
 
 def _freed(problem: JointProblem, state: JointState, pose: int) -> tuple[JointProblem, JointState]:

@@ -7,6 +7,7 @@ import pytest
 
 from robcal.drift.control import ControlState, DriftControl, started
 from robcal.drift.fit import fit_drift
+from robcal.drift.jumps import CRASH, smallest_jumps, unwatched_joints
 from robcal.drift.reference import DriftReference, freeze
 from robcal.errors import InvalidInput
 from tests.drift.scenes import SIGMA, Scene, make_scene
@@ -169,3 +170,18 @@ def test_bad_references_are_refused(scene: Scene) -> None:
         freeze(scene.robot, scene.readings(0, rows=[0, 1, 2]))
     with pytest.raises(InvalidInput, match=r"no parameter 'axis9.x'"):
         freeze(scene.robot, scene.readings(0), parameters=["axis9.x"])
+
+
+def test_a_joint_that_the_tour_hardly_moves_is_named(scene: Scene, reference: DriftReference) -> None:
+    smallest = smallest_jumps(reference)
+    named = {sentence.split(" ", 1)[0] for sentence in unwatched_joints(reference)}
+    assert named == {name for name, size in smallest.items() if size > CRASH}
+    # a sensor whose targets lie on the axis of the last joint does not see it turn
+    kernel = reference.kernel.with_references(None, np.eye(4))
+    poses = kernel.poses(reference.q)
+    flange = kernel.frames(kernel.theta0, poses)
+    along = kernel.joint_jacobian(kernel.theta0, poses)[:, 3:, 5]
+    on_axis = flange[:, :3, 3] + 0.3 * np.einsum("nij,nj->ni", flange[:, :3, :3], along)
+    blind = replace(reference, p=on_axis)
+    assert smallest_jumps(blind)["axis6"] > 20.0 * smallest_jumps(blind)["axis1"]
+    assert any(sentence.startswith("axis6 cannot be watched by this tour") for sentence in unwatched_joints(blind))

@@ -10,6 +10,7 @@ from robcal.errors import InvalidInput
 from robcal.photogrammetry.core.adjustable import AdjustableCamera, adjustable, adjustable_names, plain
 from robcal.photogrammetry.core.camera import INTRINSIC_NAMES, Camera, normalise, project, project_with_jacobians
 from robcal.photogrammetry.core.lenses import FisheyeCamera, RationalCamera
+from robcal.photogrammetry.core.splined import SplinedCamera, shift
 from robcal.photogrammetry.measure.points import measure_points
 from robcal.photogrammetry.station.network import StationMarks
 from robcal.photogrammetry.station.orientation import orient_station
@@ -108,3 +109,24 @@ def test_a_survey_adjusts_the_lens(lens: Camera) -> None:
     assert np.sqrt(np.mean(error**2)) < 5e-5
     with pytest.raises(InvalidInput, match="engine pycolmap adjusts Brown's lens alone"):
         survey_body(images, targets, size=SIZE, camera=start, scale_bars=bar, engine="pycolmap")
+
+
+def test_a_station_takes_a_splined_lens() -> None:
+    rng = np.random.default_rng(4)
+    lens = replace(
+        SplinedCamera(*SIZE, 3500.0, 3500.0, 1230.0, 1015.0, -0.08, 0.05, 2e-4, -1e-4),
+        nodes=1.5 * rng.standard_normal((6, 7, 2)),
+    )
+    s = simulate(points=8, flat=False, poses=20)
+    for name, marks in s.marks.items():
+        camera_T_body = invert(s.world_T_camera[name]) @ s.world_T_body[marks.pose]
+        p = transform(camera_T_body, s.true_points[s.body.index(marks.target)])
+        u = seen(Camera(*SIZE, *lens.vector), p)
+        noisy = u + shift(lens, u)[0] + 0.02 * rng.standard_normal(u.shape)
+        s.marks[name] = replace(marks, xy=noisy)
+    start = replace(lens, fx=lens.fx * 1.003, fy=lens.fy * 1.003)
+    o = orient_station(s.marks, s.body, dict.fromkeys(s.cameras, start), s.sizes)
+    assert 0.9 < o.sigma0 < 1.1
+    assert all(isinstance(camera, SplinedCamera) for camera in o.cameras)
+    rough = orient_station(s.marks, s.body, dict.fromkeys(s.cameras, start.brown), s.sizes)
+    assert rough.rms_px > 3.0 * o.rms_px

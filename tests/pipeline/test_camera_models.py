@@ -8,6 +8,7 @@ import pytest
 from robcal.errors import InvalidInput
 from robcal.files.camera_export import EXPORTS, colmap_text, kalibr_text, ros_text
 from robcal.files.camera_file import CameraFile, read_camera, write_camera
+from robcal.photogrammetry.core.adjustable import adjustable
 from robcal.photogrammetry.core.camera import Camera
 from robcal.photogrammetry.core.lenses import FisheyeCamera, RationalCamera
 
@@ -20,6 +21,8 @@ CAMERAS = pytest.mark.parametrize("camera", [BROWN, RATIONAL, FISHEYE], ids=["br
 @CAMERAS
 def test_own_files_keep_the_lens(tmp_path: Path, camera: Camera) -> None:
     write_camera(tmp_path / "c.yaml", CameraFile(camera))
+    assert read_camera(tmp_path / "c.yaml").camera == camera
+    write_camera(tmp_path / "c.yaml", CameraFile(adjustable(camera)))
     assert read_camera(tmp_path / "c.yaml").camera == camera
 
 
