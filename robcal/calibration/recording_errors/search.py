@@ -53,7 +53,7 @@ def _log_words(model: RobotModel) -> str:
 def find_faults(
     model: RobotModel, poses: PoseInputs, observations: Sequence[Observations], share: float = SUSPICIOUS_SHARE
 ) -> list[RecordingFault]:
-    """Faults that explain why the nominal robot residuals the measurements by far; best explanation first.
+    """Faults that explain why the nominal robot misses the measurements by far; best explanation first.
 
     ``share`` of the workspace that the nominal robot may miss before anything is suspected; zero looks in any case.
     Empty if the nominal robot fits as robots do, or if nothing known corrects the residual. Several: the data cannot
@@ -181,7 +181,7 @@ def check_joint_log(
 def check_failed_fit(
     robot: RobotModel, inputs: PoseInputs, recording: RobotRecording, kernel: Kernel, found: IdentifiedRobot
 ) -> None:
-    """Where even the identified robot residuals by many sigmas, look for smaller faults (a sign of the last joint, say).
+    """Where even the identified robot misses by many sigmas, look for smaller faults (a sign of the last joint, say).
 
     Raises
     ------
@@ -200,7 +200,7 @@ def check_failed_fit(
     size = float(np.linalg.norm(np.std(T[:, :3, 3], axis=0)))
     if residual > max(HOPELESS, HOPELESS_SHARE * size):
         raise InvalidInput(
-            f"even the identified robot residuals the measurements by {1e3 * residual:.3g} mm RMS: joint "
+            f"even the identified robot misses the measurements by {1e3 * residual:.3g} mm RMS: joint "
             "angles, robot file and measurements do not belong together, and no single fault (sign, unit, exchanged "
             "columns, shifted rows) explains it: check which recording belongs to which"
         )
