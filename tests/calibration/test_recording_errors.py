@@ -108,6 +108,23 @@ def test_couplings(sound: Scenario, measured: FrameObservations, k: int, j: int,
     assert f"its angle is q{k + 1} {'+' if by > 0 else '-'} q{j + 1}" in slips[0].statement
 
 
+@pytest.mark.parametrize("what", ["coupling", "sense"])
+def test_faults_that_few_poses_show_where_one_joint_moves_after_the_other(sound: Scenario, what: str) -> None:
+    q = np.tile(np.radians([10.0, 20.0, -15.0, 30.0, 40.0, 50.0]), (42, 1))
+    for joint in range(6):
+        q[7 * joint : 7 * joint + 7, joint] += np.radians(np.linspace(-40, 40, 7))
+    poses = sound.poses.subset(np.arange(42)).with_q(q)
+    written = q.copy()
+    if what == "coupling":
+        written[:, 2] -= q[:, 1]
+    else:
+        written[:, 4] *= -1.0
+    assert find_faults(sound.model, poses, [sound.frames(poses)]) == []
+    fault = find_faults(sound.model, poses.with_q(written), [sound.frames(poses)])[0]
+    assert fault.kind == ("coupled_joints" if what == "coupling" else "wrong_sign")
+    assert fault.where == ("axis3 and axis2" if what == "coupling" else "axis5")
+
+
 @pytest.mark.parametrize("offsets", [{1: 90.0}, {2: -90.0}, {4: 90.0}, {1: -90.0, 2: 90.0}, {2: 37.0}])
 def test_zeros_of_any_size_are_told_with_start_values(
     sound: Scenario, measured: FrameObservations, offsets: dict[int, float]

@@ -5,6 +5,7 @@ Faults of the recording that make a fit fail, reported with the proof: the resid
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from itertools import chain
 
 import numpy as np
 
@@ -18,7 +19,9 @@ from robcal.calibration.recording_errors.recorded import (
     RecordingFault,
     Trial,
     as_frames,
+    pose_residuals,
     residual_rms,
+    trimmed,
     workspace,
 )
 from robcal.calibration.recording_errors.rows import row_trials, stray_rows
@@ -88,8 +91,22 @@ def _groups(
         yield lambda: _proved(measured_trials(plain), plain, _spread(plain, fast))
     if fast:
         yield lambda: _proved(stray_rows(recorded), recorded, recorded)
+    if fast and not suspicious:
+        yield lambda: _proved_by_some(recorded)
     if fast and suspicious and np.isfinite(before):
         yield lambda: deviating(few, before, as_robots_do(recorded))
+
+
+def _proved_by_some(recorded: Recorded) -> list[RecordingFault]:
+    """Faults of joints that move in few poses only, as where one joint moves after the other: most poses fit as is."""
+    residuals = pose_residuals(recorded)
+    if not trimmed(residuals, 1.0) >= as_robots_do(recorded):
+        return []
+    spread = np.linspace(0, len(residuals) - 1, min(SCREENED, len(residuals))).astype(np.int64)
+    worst = np.argsort(-np.nan_to_num(residuals))[:SCREENED]
+    few = recorded.subset(np.unique(np.concatenate([spread, worst])))
+    trials = (replace(trial, robust=False) for trial in chain(joint_trials(recorded, True), chain_trials(recorded)))
+    return _proved(trials, recorded, few)
 
 
 def as_robots_do(recorded: Recorded) -> float:
