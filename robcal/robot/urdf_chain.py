@@ -23,6 +23,7 @@ from robcal.transforms import Array, frame, invert, rotation_from_rpy, rpy_from_
 
 LARGEST = 1e30
 """Numbers beyond are no length, angle or mass of a robot."""
+_DECIMAL = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 NEGLIGIBLE_MASS = 1e-3
 """kg; lighter links stand for links of unknown mass (simulators refuse links without)."""
 LARGEST_LIMIT = 25.0
@@ -93,7 +94,7 @@ def _check_plain(root: ElementTree.Element) -> None:
             )
     for joint in root.iter("joint"):
         for origin in joint.iter("origin"):
-            angles = [float(v) for v in re.findall(r"[-+.\deE]+", origin.get("rpy", "")) if re.search(r"\d", v)]
+            angles = [float(v) for v in re.findall(_DECIMAL, origin.get("rpy", ""))]
             if max(map(abs, angles), default=0.0) > 2.0 * math.pi + 1e-6:
                 raise InvalidInput(
                     f"URDF joint '{joint.get('name')}' has rpy=\"{origin.get('rpy')}\": URDF wants radians, these look "
