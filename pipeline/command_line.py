@@ -76,13 +76,15 @@ def _sentences(error: RobcalError) -> list[str]:
 
 
 def _fail(command: str, as_json: bool, *sentences: str, code: int = 1) -> None:
-    for sentence in sentences[:SHOWN]:
-        typer.echo(f"error: {sentence}", err=True)
-    if len(sentences) > SHOWN:
-        typer.echo(f"error: and {len(sentences) - SHOWN} more: --json lists all", err=True)
+    # one line is the contract; only the refused lines of a program are wanted all at once
+    shown = sentences[: SHOWN if command == "program" else 1]
+    more = len(sentences) - len(shown)
+    for number, sentence in enumerate(shown, 1):
+        rest = f" (and {more} more: --json lists all)" if more and number == len(shown) else ""
+        typer.echo(f"error: {sentence}{rest}", err=True)
     if as_json:
-        more = {"errors": list(sentences)} if len(sentences) > 1 else {}
-        typer.echo(json.dumps({"ok": False, "command": command, "error": sentences[0], **more}))
+        several = {"errors": list(sentences)} if len(sentences) > 1 else {}
+        typer.echo(json.dumps({"ok": False, "command": command, "error": sentences[0], **several}))
     raise typer.Exit(code)
 
 

@@ -107,7 +107,7 @@ def sensed_points(
     """
     table.require(["pose", "target"])
     readings = readings_of(table, sensor.kind)
-    pose, notes = pose_index(table, pose_names)
+    pose = pose_index(table, pose_names)
     target = target_ids(table)
     table.unique(["pose", "target", *(["cycle"] if table.has("cycle") else [])])
     names, ranges = READINGS[sensor.kind], sensor.ranges.tolist()
@@ -123,17 +123,7 @@ def sensed_points(
     shared = SharedErrors(noise, J, sensor.covariance)
     covariates = {name: table.numbers(name) for name in ("cycle", "time_s") if table.has(name)}
     return MeasuredTable(
-        "sensor_points",
-        table.path,
-        pose,
-        table.rows,
-        target,
-        p,
-        shared.total,
-        covariates,
-        tuple(notes),
-        shared=shared,
-        q=q,
+        "sensor_points", table.path, pose, table.rows, target, p, shared.total, covariates, shared=shared, q=q
     )
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from fixtures.campaigns import make_campaign
-from pipeline.artifacts import IDENTIFICATION
+from pipeline.artifacts import IDENTIFIED
 from pipeline.exports import Wanted, export_run
 from pipeline.prediction import CompensateOptions, compensate_run, predict_run
 from pipeline.runner import run_campaign
@@ -45,10 +45,9 @@ def finished(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFa
     )
     run_campaign(folder / "campaign", folder / "run", until="identify")
     run = open_run(folder / "run")
-    found = run.load(IDENTIFICATION)
-    assert found.robot.statics == request.param
-    with_terms = replace(found.robot, model=found.robot.model.with_terms(TERMS))
-    run.save(IDENTIFICATION, replace(found, robot=with_terms))
+    found = run.load(IDENTIFIED)
+    assert found.statics == request.param
+    run.save(IDENTIFIED, replace(found, model=found.model.with_terms(TERMS)))
     return folder / "campaign", folder / "run"
 
 

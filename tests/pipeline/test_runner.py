@@ -36,7 +36,19 @@ def results(folder: Path) -> dict[str, object]:
 
 
 def test_contract_order_of_stages() -> None:
-    order = ("detect", "survey", "orient", "measure", "frames", "identify", "diagnose", "verify", "hand_eye", "report")
+    order = (
+        "detect",
+        "survey",
+        "orient",
+        "measure",
+        "frames",
+        "identify",
+        "diagnose",
+        "adjust",
+        "verify",
+        "hand_eye",
+        "report",
+    )
     assert order == STAGE_NAMES
 
 
