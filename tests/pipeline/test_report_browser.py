@@ -51,6 +51,7 @@ def test_the_report_of_a_diagnosed_robot(diagnosed: Run) -> None:  # noqa: F811
     assert state["scroll"] <= 0
 
 
+@pytest.mark.slow
 def test_the_report_of_images(image_run: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(image_run, tmp_path / "run")
     with page_of(write_report(open_run(folder)), width=390) as (tab, problems, requests):

@@ -168,6 +168,7 @@ def test_kill_minus_nine_and_resume_gives_the_same_result(
     assert results(tmp_path / "killed") == whole
 
 
+@pytest.mark.slow
 def test_killed_in_diagnosis_verification_and_report(frame_campaign: Path, tmp_path: Path) -> None:
     edit_yaml(frame_campaign / "campaign.yaml", lambda d: d.pop("diagnosis"))
     whole, killed = tmp_path / "whole", tmp_path / "killed"

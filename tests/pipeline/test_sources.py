@@ -16,6 +16,7 @@ from pipeline.sources import ROOT, all_modules, code_version, reachable
 from pipeline.stages.registry import STAGES
 
 STAGE_MODULES = [stage.module for stage in STAGES]
+MODULES = frozenset(all_modules())
 
 
 def file_of(module: str, root: Path = ROOT) -> Path:
@@ -34,7 +35,7 @@ def imports_by_parser(module: str) -> frozenset[str]:
             assert not node.level, "relative imports are not used here"
             names |= {str(node.module), *(f"{node.module}.{alias.name}" for alias in node.names)}
     names |= {name.rsplit(".", n)[0] for name in names for n in range(name.count(".") + 1)}
-    return frozenset(names & set(all_modules()))
+    return frozenset(names & MODULES)
 
 
 def running(node: ast.AST) -> Iterator[ast.AST]:
