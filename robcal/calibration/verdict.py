@@ -120,7 +120,18 @@ def _mirror(f: Facts) -> str:
 
 
 def _convergence(f: Facts) -> str:
-    return "" if f.converged else "the identification did not converge"
+    return "" if f.converged or _tested(f) else "the identification did not converge"
+
+
+def _unfinished(f: Facts) -> str:
+    if f.converged or not _tested(f):
+        return ""
+    return "the identification did not converge, though its uncertainties hold at the kept-out poses"
+
+
+def _tested(f: Facts) -> bool:
+    """Whether kept-out poses show that the stated uncertainties hold, whatever the iterations did."""
+    return f.coverage_95 is not None and f.coverage_95 >= LEAST_COVERAGE and f.kept_out >= FEWEST_KEPT_OUT
 
 
 def _sigma0(f: Facts) -> str:
@@ -187,6 +198,7 @@ RULES: tuple[Rule, ...] = (
     Rule("mirrored", "bad", _mirror),
     Rule("agreement", "bad", lambda f: "; ".join(f.disagreeing)),
     Rule("convergence", "bad", _convergence),
+    Rule("unfinished", "care", _unfinished),
     Rule("sigma0", "care", _sigma0),
     Rule("before", "care", _before),
     Rule("geometry", "care", _geometry),
