@@ -88,7 +88,9 @@ def test_slip_of_the_log_is_named(sound: Scenario, measured: FrameObservations, 
     assert len(slips) == 1
 
 
-@pytest.mark.parametrize("wrong", SENSES, ids=str)
+@pytest.mark.parametrize(
+    "wrong", [pytest.param(s, marks=[pytest.mark.slow] * (3 <= len(s) <= 5)) for s in SENSES], ids=str
+)
 def test_every_set_of_wrong_senses(sound: Scenario, measured: FrameObservations, wrong: tuple[int, ...]) -> None:
     q = sound.poses.q.copy()
     q[:, list(wrong)] *= -1

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from robcal.diagnosis.core.fitting import fit
 from robcal.diagnosis.diagnose import diagnose
@@ -20,6 +21,7 @@ def test_the_outermost_poses_lie_at_the_longer_end() -> None:
     assert np.all(np.flatnonzero(region) >= 40)
 
 
+@pytest.mark.slow
 def test_what_was_left_out_shows_outside_the_range(tmp_path: Path) -> None:
     found, identify, _, _ = concealed(tmp_path, seed=4, effects=["joint_eccentricity"], snr=25.0)
     result = diagnose(

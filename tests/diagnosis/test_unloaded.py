@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from robcal.calibration.identification import IdentifiedRobot
 from robcal.diagnosis.core.recording import Recording
@@ -27,6 +28,7 @@ def test_a_vertical_axis_takes_the_value_of_its_neighbour_and_nothing_changes(tm
     assert "axis1.elastic_yaw" not in result.model.parameters
 
 
+@pytest.mark.slow
 def test_a_base_off_the_plumb_line_acts_through_it(tmp_path: Path) -> None:
     found, identify, verify, truth = concealed(tmp_path, seed=10073, effects=["base_tilt"], snr=10.0)
     result = run(found, identify, verify)

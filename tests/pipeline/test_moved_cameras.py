@@ -78,6 +78,7 @@ def test_healthy_station_gets_no_epoch_and_a_better_robot_than_from_frames_alone
     assert np.allclose(joint, station.body_covariance[at], rtol=0.02, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_moved_base_may_be_moved_cameras(tmp_path: Path) -> None:
     effect = draw_own_effect(OwnPlan(**PLAN), "base_moved", 20.0)
     make_own(tmp_path / "campaign", effects=[effect], **PLAN)
