@@ -176,8 +176,9 @@ def measured_lights(table: Table, pose_names: Sequence[str], system: LineCameraS
     InvalidInput : as :func:`lights_of`; a pose that is not in the table of poses.
     """
     table.require(READING)
-    pose, notes = pose_index(table, pose_names), list[str]()
+    pose = pose_index(table, pose_names)
     target = target_ids(table)
+    notes: list[str] = []
     lights, found = lights_of(table, system)
     good = np.asarray(np.isfinite(found.p_world).all(axis=1))
     shared = SharedErrors(found.covariance[good], found.jacobian[good], system.covariance)

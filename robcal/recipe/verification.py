@@ -12,7 +12,7 @@ from robcal.calibration.joint_log import JointLog
 from robcal.calibration.measurements import RobotRecording, Rows, well_measured
 from robcal.calibration.observations import FrameObservations
 from robcal.calibration.verification import Verification, cross_validate, fit_nominal, repetitions, tool_errors, verify
-from robcal.errors import InvalidInput, NotIdentifiable
+from robcal.errors import InvalidInput, RobcalError
 from robcal.recipe.identification import Identification
 from robcal.recipe.robot_diagnosis import RobotDiagnosis
 from robcal.robot.kernel import PoseInputs
@@ -25,6 +25,8 @@ BLUNDER, LEAST_BLUNDER = 5.0, 0.02
 and by this much (m) more."""
 FAR, FEWEST_OF_A_PLACE = 5.0, 10
 """Factor by which errors shrink once base and tool are fitted to poses measured elsewhere, and how many these are."""
+ALIKE = 3.0
+"""Factor by which these then scatter more than the poses that identified the robot, at most."""
 SIGMAS = 4.0
 """Standard errors by which the mean of the residuals may differ from zero."""
 
@@ -138,15 +140,15 @@ def measured_elsewhere(
     robot: CalibratedRobot, inputs: PoseInputs, recording: RobotRecording, rows: Rows, kept_out: Rows
 ) -> str:
     """Whether another base and tool explain what the robot misses at the kept-out poses, in words; empty if not."""
-    before = _rms(robot, inputs, recording, kept_out)
-    if len(kept_out) < FEWEST_OF_A_PLACE or before < FAR * _rms(robot, inputs, recording, rows):
+    before, identified = _rms(robot, inputs, recording, kept_out), _rms(robot, inputs, recording, rows)
+    if len(kept_out) < FEWEST_OF_A_PLACE or before < FAR * identified:
         return ""
     try:
         moved = with_fitted_cell(robot.kernel, inputs.subset(kept_out), recording.select(kept_out), anew=True)
-    except NotIdentifiable:  # these poses tell no base and tool: nothing speaks for another place
+    except (RobcalError, np.linalg.LinAlgError):  # these poses determine no base and tool: nothing speaks for a place
         return ""
     after = _rms(replace(robot, model=moved), inputs, recording, kept_out)
-    if before < FAR * after:
+    if before < FAR * after or after > ALIKE * identified:  # something else is wrong with them as well
         return ""
     return (
         f"the kept-out poses lie off together: {1e3 * before:.3g} mm as measured, {1e3 * after:.3g} mm once base and "

@@ -7,7 +7,7 @@ import numpy as np
 from robcal import transforms as tf
 from robcal.calibration.identification import identify
 from robcal.calibration.measurements import RobotRecording, well_measured
-from robcal.calibration.observations import FrameObservations
+from robcal.calibration.observations import DistanceObservations, FrameObservations
 from robcal.recipe.verification import measured_elsewhere
 from tests.calibration.scenarios import scenario
 
@@ -51,3 +51,14 @@ def test_kept_out_poses_measured_from_another_place_are_told() -> None:
     assert "another place" in measured_elsewhere(
         robot, s.poses, RobotRecording((other,), (other,), True), rows, kept_out
     )
+
+
+def test_a_wrong_length_of_a_wire_is_no_other_place() -> None:
+    s = scenario(3)
+    robot = identify(s.model, s.poses, [s.frames(s.poses)])
+    n = len(s.poses)
+    rows, kept_out = np.arange(n // 2), np.arange(n // 2, n)
+    length = np.linalg.norm(s.frames(s.poses).world_T_tool[:, :3, 3], axis=1)
+    length[kept_out] += 0.3
+    wire = DistanceObservations(np.arange(n), length, np.full(n, 5e-5))
+    assert measured_elsewhere(robot, s.poses, RobotRecording((wire,), (wire,), True), rows, kept_out) == ""
